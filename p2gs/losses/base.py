@@ -1,0 +1,129 @@
+"""What a loss is: a small dataclass with a weight and a span of steps, called with what the phase has at hand.
+
+Write one in a file of your own::
+
+    from p2gs.losses.base import Loss, LossInputs, register_loss
+
+    @register_loss("brightness")
+    class Brightness(Loss):
+        target: float = 0.5
+
+        def compute(self, inputs: LossInputs):
+            return (inputs.render.colour.mean() - self.target) ** 2
+
+and switch it on from YAML: ``losses: {brightness: {weight: 0.1}}``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Optional
+
+from torch import Tensor
+
+from p2gs.registry import Registry
+from p2gs.types import Camera, GaussianTensors, RenderOutput
+
+LOSSES: Registry[type["Loss"]] = Registry("loss")
+
+
+@dataclass
+class Target:
+    """What a rendered view is held against, already cropped and scaled to the render.
+
+    image: [H, W, 3] float32 composited over ``background``.  alpha: [H, W] float32.  depth: [H, W] float32 (0 = unknown) or None.
+    background: [3].  key: identifies (view, resolution, crop) for cached statistics.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    background: Tensor
+    depth: Optional[Tensor] = None
+    key: object = None
+
+
+@dataclass
+class PartState:
+    """The articulation phase's quantities of one step. K parts including the static slot 0.
+
+    probs [N, K] soft assignment.  means_canonical [N, 3].  transforms [K, 4, 4]: start -> end (slot 0 identity).
+    pairs [M] int64: indices of Gaussians with an observed pair; mu0, mu1 [M, 3]: their observed centres in both states (detached).
+    knn [N, k] int64: neighbours in canonical space, self excluded.  target_rotation [K, 3, 3]: detached Kabsch fit of the pairs.
+    repel_points [R, 3] in state-0 coordinates, or None.  extent: diagonal of the object's box.  spacing: median nearest-neighbour
+    distance of the Gaussians.  hardness in [0, 1]: how far the soft-to-hard schedule has come.
+    """
+
+    probs: Tensor
+    means_canonical: Tensor
+    transforms: Tensor
+    canonical_time: float
+    extent: float
+    spacing: float
+    pairs: Optional[Tensor] = None
+    mu0: Optional[Tensor] = None
+    mu1: Optional[Tensor] = None
+    knn: Optional[Tensor] = None
+    target_rotation: Optional[Tensor] = None
+    repel_points: Optional[Tensor] = None
+    hardness: float = 0.0
+
+
+@dataclass
+class LossInputs:
+    """All a loss may look at in one training step. Fields a phase does not have are None.
+
+    ``render``/``target``: the rendered view and its photograph.  ``gaussians``: the parameters as stored (canonical or single-state).
+    ``parts``: articulation quantities.  ``step``/``total_steps``: of the phase, counted from 0.
+    """
+
+    step: int
+    total_steps: int
+    gaussians: GaussianTensors
+    render: Optional[RenderOutput] = None
+    target: Optional[Target] = None
+    camera: Optional[Camera] = None
+    parts: Optional[PartState] = None
+    cache: dict = field(default_factory=dict)
+
+
+@dataclass
+class Loss:
+    """Base of every loss.
+
+    weight: factor in the total.  start, end: active while start <= step / total_steps < end (fractions of the phase).
+    end_weight: when given, the weight moves from ``weight`` to it, geometrically, between start and end.
+    """
+
+    weight: float = 1.0
+    start: float = 0.0
+    end: float = 1.0
+    end_weight: Optional[float] = None
+
+    def active(self, step: int, total_steps: int) -> bool:
+        return self.weight != 0 and self.start <= step / max(total_steps, 1) < self.end
+
+    def weight_at(self, step: int, total_steps: int) -> float:
+        if self.end_weight is None:
+            return self.weight
+        span = max(self.end - self.start, 1e-9)
+        x = min(max((step / max(total_steps, 1) - self.start) / span, 0.0), 1.0)
+        return self.weight * (max(self.end_weight, 1e-12) / self.weight) ** x
+
+    def compute(self, inputs: LossInputs) -> Optional[Tensor]:
+        """The unweighted scalar, or None where this phase does not have what the loss needs."""
+        raise NotImplementedError
+
+    def __call__(self, inputs: LossInputs) -> Optional[Tensor]:
+        if not self.active(inputs.step, inputs.total_steps):
+            return None
+        value = self.compute(inputs)
+        return None if value is None else value * self.weight_at(inputs.step, inputs.total_steps)
+
+
+def register_loss(name: str):
+    """Decorator: make the class a dataclass and register it under ``name``."""
+
+    def wrap(cls: type[Loss]) -> type[Loss]:
+        return LOSSES.register(name)(dataclass(cls))
+
+    return wrap
