@@ -1,0 +1,23 @@
+// One bind function per family of kernels, each defined in bind_<family>.cpp.
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+#include <cstdint>
+
+namespace nb = nanobind;
+
+namespace p2gs {
+
+using Address = std::uintptr_t;  // what tensor.data_ptr() returns; 0 = none
+using WithoutGil = nb::call_guard<nb::gil_scoped_release>;
+
+template <class T>
+T* pointer(Address a) {
+    return reinterpret_cast<T*>(a);
+}
+
+void bind_adam(nb::module_& m);
+void bind_raster(nb::module_& m);
+
+}  // namespace p2gs

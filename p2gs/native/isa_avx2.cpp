@@ -1,0 +1,2 @@
+#define P2GS_NS avx2
+#include "isa_body.inc"

@@ -1,0 +1,2 @@
+#define P2GS_NS portable
+#include "isa_body.inc"
