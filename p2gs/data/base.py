@@ -1,0 +1,135 @@
+"""What every data source is to the rest of p2gs: a LightningDataModule that yields one ``TwoStateScene``.
+
+A new source is a subclass with one method, ``read()``, registered by name::
+
+    @DATASETS.register("mine")
+    class MyData(TwoStateData):
+        def read(self) -> TwoStateScene: ...
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Iterator, Literal, Optional
+
+import numpy as np
+from lightning.pytorch import LightningDataModule
+
+from p2gs.data.box import farthest_cameras, normalise
+from p2gs.data.frames import Frame
+from p2gs.data.images import DepthMode, read_views
+from p2gs.data.report import Report, StrictReport
+from p2gs.data.views import view_index
+from p2gs.registry import Registry
+from p2gs.types import TwoStateScene, UserError
+
+DATASETS: Registry[type["TwoStateData"]] = Registry("data format")
+
+
+class ViewLoader:
+    """An endless loader of ``(step, view)`` pairs, addressed by step so that a resumed run sees what an unbroken one would.
+
+    n_views: views to choose from.  seed: of the order.  length: batches in a Lightning epoch (default: one pass over the views).
+    ``state_dict`` holds the next step; Lightning saves and restores it with the checkpoint.
+    """
+
+    def __init__(self, n_views: int, seed: int = 0, length: Optional[int] = None):
+        self.n_views, self.seed, self.length, self.step = n_views, seed, length or n_views, 0
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        while True:
+            step, self.step = self.step, self.step + 1
+            yield step, view_index(self.seed, step, self.n_views)
+
+    def state_dict(self) -> dict:
+        return {"step": self.step}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.step = int(state["step"])
+
+
+class TwoStateData(LightningDataModule):
+    """One object in two states.
+
+    Args:
+        root: folder of the scene.
+        downscale: images are divided by this factor in width and height when read (1 = as on disk).
+        max_views: at most so many training views a state, a farthest-point subset of the cameras (None = all).
+        depth: ``auto`` reads depth where it is there, ``never`` leaves it out, ``always`` demands it.
+        seed: of the order in which views are visited.
+        normalize: ``object`` trains with the object's box (found from the masks) centred and 2 units in diagonal, ``none`` as on disk.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        downscale: float = 1.0,
+        max_views: Optional[int] = None,
+        depth: DepthMode = "auto",
+        seed: int = 0,
+        normalize: Literal["object", "none"] = "object",
+    ):
+        super().__init__()
+        if downscale < 1.0:
+            raise UserError(f"data.downscale is {downscale:g}, but it divides the image size and must be at least 1")
+        if max_views is not None and max_views < 1:
+            raise UserError(f"data.max_views is {max_views}, but it must be at least 1")
+        self.root, self.downscale, self.max_views = root, downscale, max_views
+        self.depth, self.seed, self.normalize = depth, seed, normalize
+        self._raw: Optional[TwoStateScene] = None
+        self._scene: Optional[TwoStateScene] = None
+
+    def read(self) -> TwoStateScene:
+        """The scene in input units. Raises UserError for the first problem met in the files."""
+        root = Path(self.root)
+        if not root.is_dir():
+            raise UserError(f"{root}: scene folder is missing")
+        report = StrictReport()
+        frames = thin_out(self.index(root, report), self.max_views)
+        return TwoStateScene(root.resolve().name, tuple(read_views(frames, report, self.downscale, self.depth)))
+
+    def index(self, root: Path, report: Report) -> list[Frame]:
+        """The scene's frames (layouts on disk override this)."""
+        raise NotImplementedError(f"{type(self).__name__} has to define read() or index()")
+
+    def raw_scene(self) -> TwoStateScene:
+        """The scene in input units (similarity is the identity); read once."""
+        if self._raw is None:
+            self._raw = self.read()
+        return self._raw
+
+    def scene(self) -> TwoStateScene:
+        """The scene as training sees it: internal units, ``box`` set; made once. ``similarity`` leads back to input units."""
+        if self._scene is None:
+            raw = self.raw_scene()
+            self._scene = normalise(raw) if self.normalize == "object" else with_box(raw)
+        return self._scene
+
+    def setup(self, stage: Optional[str] = None) -> None:
+        self.scene()
+
+    def train_dataloader(self) -> ViewLoader:
+        """``(step, view)`` over the training views of both states (start's first), in the order of ``scene().select(split="train")``."""
+        return ViewLoader(len(self.scene().select(split="train")), self.seed)
+
+
+def with_box(scene: TwoStateScene) -> TwoStateScene:
+    """The same scene, its box found from the masks."""
+    from p2gs.data.box import object_box
+
+    return TwoStateScene(scene.name, scene.views, scene.similarity, object_box(scene.select(split="train")))
+
+
+def thin_out(frames: list[Frame], max_views: Optional[int]) -> list[Frame]:
+    """At most ``max_views`` training frames a state, spread over the cameras' positions; other splits stay whole."""
+    if max_views is None:
+        return frames
+    keep = [f for f in frames if f.split != "train"]
+    for state in (0, 1):
+        mine = [f for f in frames if f.split == "train" and f.state == state]
+        if mine:
+            keep += [mine[i] for i in farthest_cameras(np.stack([f.position for f in mine]), max_views)]
+    return sorted(keep, key=lambda f: (f.state, f.split != "train", f.split))

@@ -1,0 +1,91 @@
+"""The DTA (DigitalTwinArt) layout: one ``cam_K.txt``, ``init_keyframes.yml``, ``color_segmented``, ``mask``, ``depth_filtered``.
+
+A frame id is ``<t>_<view>`` with t = 0 or 1; ``cam_in_ob`` is camera-to-world in OpenGL axes; depth is uint16 millimetres.
+All frames are training views. Format: DigitalTwinArt, main.py and preproc/gen_correspondence.py.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Optional
+
+import numpy as np
+
+from p2gs.data.frames import Frame, check_frames, check_K, opengl_pose
+from p2gs.data.report import Report
+
+
+def detect(root: Path) -> bool:
+    return (root / "init_keyframes.yml").is_file() or (root / "color_segmented").is_dir()
+
+
+def ground_truth_folder(root: Path) -> Optional[Path]:
+    return root / "gt" if (root / "gt").is_dir() else None
+
+
+def _read_K(path: Path, report: Report) -> Optional[np.ndarray]:
+    if not path.is_file():
+        report.error(f"{path}: camera file is missing")
+        return None
+    try:
+        values = np.array(path.read_text().replace(",", " ").split(), dtype=np.float64)
+    except ValueError:
+        values = np.empty(0)
+    if values.size != 9:
+        report.error(f"{path}: should hold the 9 numbers of K")
+        return None
+    return check_K(values, str(path), report)
+
+
+def _read_keyframes(path: Path, report: Report) -> Optional[dict]:
+    import yaml
+
+    if not path.is_file():
+        report.error(f"{path}: camera file is missing")
+        return None
+    try:
+        keyframes = yaml.load(path.read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except yaml.YAMLError as err:
+        report.error(f"{path}: is not valid YAML ({str(err).splitlines()[0]})")
+        return None
+    if not isinstance(keyframes, dict) or not keyframes:
+        report.error(f"{path}: has no frames")
+        return None
+    return keyframes
+
+
+def index(root: Path, report: Report) -> list[Frame]:
+    """Every frame of both states. Errors: missing camera file, image or mask, bad pose, K or frame name."""
+    K = _read_K(root / "cam_K.txt", report)
+    keyframes = _read_keyframes(root / "init_keyframes.yml", report)
+    if K is None or keyframes is None:
+        return []
+    frames: list[Frame] = []
+    has_depth = (root / "depth_filtered").is_dir()
+    if not has_depth:
+        report.note(f"{root / 'depth_filtered'}: folder is missing, so the scene is read without depth")
+    for key, entry in keyframes.items():
+        name, where = str(key).removeprefix("frame_"), f"{root / 'init_keyframes.yml'}: frame '{key}'"
+        if not isinstance(entry, dict) or "cam_in_ob" not in entry:
+            report.error(f"{where} has no camera pose 'cam_in_ob'")
+            continue
+        prefix = name.split("_")[0]
+        time = entry.get("time", int(prefix) if prefix.isdigit() else None)
+        if time not in (0, 1):
+            report.error(f"{where} belongs to the time {time}, but only the states 0 and 1 are supported")
+            continue
+        viewmat = opengl_pose(entry["cam_in_ob"], where, report)
+        image, mask, depth = (root / folder / f"{name}.png" for folder in ("color_segmented", "mask", "depth_filtered"))
+        missing = [p for p, needed in ((image, True), (mask, True), (depth, has_depth)) if needed and not p.is_file()]
+        for path in missing:
+            report.error(f"{path}: image is missing, but init_keyframes.yml has the frame '{key}'")
+        if viewmat is not None and not missing:
+            frames.append(
+                Frame(name, int(time), "train", image, viewmat, K=K, K_source=root / "cam_K.txt", mask=mask, depth=depth if has_depth else None)
+            )
+    known = {str(key).removeprefix("frame_") for key in keyframes}
+    unposed = sorted(p.stem for p in (root / "color_segmented").glob("*.png") if p.stem not in known)
+    if unposed:
+        report.note(f"{root / 'init_keyframes.yml'}: {len(unposed)} images have no frame and are left out, the first is {unposed[0]}.png")
+    check_frames(frames, root, report)
+    return frames

@@ -1,0 +1,187 @@
+"""Pixels of a scene: RGBA, masks and depth read in a small thread pool, checked, and down-scaled where asked.
+
+Everything stays uint8 (depth float32). Colours are straight, as on disk; down-scaling averages premultiplied colour, so that the
+colour behind alpha = 0 does not bleed into the object's edge.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Literal, Optional, Sequence
+
+import numpy as np
+import torch
+
+from p2gs.data.frames import Frame
+from p2gs.data.report import Report
+from p2gs.types import Camera, View
+
+DepthMode = Literal["auto", "never", "always"]
+MIN_DEPTH = 0.1  # scene units (metres in the layouts' words); nearer is invalid, as in DTA and ArtGS
+
+
+def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Mean over the area of each new pixel. image [H, W] or [H, W, C], any dtype that cv2.INTER_AREA takes; same dtype out."""
+    import cv2
+
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def resize_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The source pixel under each new pixel's centre (cv2's INTER_NEAREST takes the corner's, half a pixel off)."""
+    rows = ((np.arange(height) + 0.5) * image.shape[0] / height).astype(np.int64)
+    cols = ((np.arange(width) + 0.5) * image.shape[1] / width).astype(np.int64)
+    return image[rows[:, None], cols[None]]
+
+
+def premultiply(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """[H, W, 4] float32 in 0..255: colour times alpha, and alpha."""
+    out = np.empty((*alpha.shape, 4), np.float32)
+    out[..., :3] = image
+    out[..., :3] *= (alpha.astype(np.float32) * (1 / 255))[..., None]
+    out[..., 3] = alpha
+    return out
+
+
+def to_uint8(x: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(x), 0, 255).astype(np.uint8)
+
+
+def downscale_rgba(image: np.ndarray, alpha: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Straight uint8 colour [h, w, 3] and alpha [h, w], averaged premultiplied."""
+    small = resize_area(premultiply(image, alpha), width, height)
+    a = small[..., 3:]
+    colour = np.where(a > 0, small[..., :3] * 255 / np.maximum(a, 1e-3), 0)
+    return to_uint8(colour), to_uint8(a[..., 0])
+
+
+def _decode(path: Path, report: Report) -> Optional[np.ndarray]:
+    import cv2
+
+    if not path.is_file():
+        report.error(f"{path}: file is missing")
+        return None
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        report.error(f"{path}: cannot be read as an image")
+    return image
+
+
+def _read_alpha(frame: Frame, image: np.ndarray, report: Report) -> Optional[np.ndarray]:
+    if frame.mask is None:
+        if image.ndim != 3 or image.shape[2] != 4:
+            report.error(f"{frame.image}: has no alpha channel; the alpha of an RGBA image is the object's mask in this layout")
+            return None
+        alpha = image[..., 3]
+    else:
+        mask = _decode(frame.mask, report)
+        if mask is None:
+            return None
+        mask = mask if mask.ndim == 2 else mask[..., min(2, mask.shape[2] - 1)]  # cv2 gives BGR: index 2 is the file's first channel
+        if mask.shape != image.shape[:2]:
+            report.error(f"{frame.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, but its image is {image.shape[1]}x{image.shape[0]}")
+            return None
+        alpha = np.where(mask > 0, 255, 0).astype(np.uint8)
+    if not alpha.any():
+        report.error(f"{frame.mask or frame.image}: mask is empty, no pixel belongs to the object")
+        return None
+    if alpha.min() == 255:
+        report.note(f"{frame.mask or frame.image}: mask covers the whole image, so nothing parts the object from its background")
+    return alpha
+
+
+def _read_depth(frame: Frame, shape: tuple[int, int], report: Report) -> Optional[np.ndarray]:
+    depth = _decode(frame.depth, report)
+    if depth is None:
+        return None
+    if depth.ndim != 2 or depth.dtype != np.uint16:
+        report.error(f"{frame.depth}: depth should be a 16-bit single-channel PNG in millimetres")
+        return None
+    if depth.shape != shape:
+        (h, w), (height, width) = depth.shape, shape
+        if abs(w * height - h * width) > max(w, h, width, height):
+            report.error(f"{frame.depth}: is {w}x{h} pixels, which is not the shape of its {width}x{height} image")
+            return None
+        report.note(f"{frame.depth}: is {w}x{h} pixels and is brought to the image's {width}x{height} by nearest neighbour")
+        depth = resize_nearest(depth, width, height)
+    out = depth.astype(np.float32) * np.float32(1e-3)
+    out[out < MIN_DEPTH] = 0
+    return out
+
+
+def _check_fit(K: np.ndarray, frame: Frame, width: int, height: int, report: Report) -> bool:
+    cx, cy = K[0, 2], K[1, 2]
+    if not (0 < cx < width and 0 < cy < height):
+        report.error(
+            f"{frame.K_source}: K does not fit the {width}x{height} image {frame.image.name}; its principal point ({cx:.1f}, {cy:.1f}) lies outside"
+        )
+        return False
+    if abs(cx - width / 2) > 0.2 * width or abs(cy - height / 2) > 0.2 * height:
+        report.note(f"{frame.K_source}: principal point ({cx:.1f}, {cy:.1f}) is far from the centre of the {width}x{height} image {frame.image.name}")
+    return True
+
+
+def read_view(frame: Frame, report: Report, downscale: float = 1.0, depth: DepthMode = "auto") -> Optional[View]:
+    """The frame's ``View`` in input units, or None after an error in ``report``."""
+    pixels = _decode(frame.image, report)
+    if pixels is None:
+        return None
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    alpha = _read_alpha(frame, pixels, report)
+    height, width = pixels.shape[:2]
+    K = frame.intrinsics(width, height)
+    if not _check_fit(K, frame, width, height, report) or alpha is None:
+        return None
+    colour = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels[..., 2::-1]
+    z = None
+    if depth != "never" and frame.depth is not None:
+        z = _read_depth(frame, (height, width), report)
+        if z is None:
+            return None
+        z[alpha < 128] = 0
+    elif depth == "always":
+        report.error(f"{frame.image}: has no depth, but the option depth=always asks for it")
+        return None
+    camera = Camera(torch.from_numpy(frame.viewmat).float(), torch.from_numpy(K).float(), width, height)
+    if downscale != 1.0:
+        w, h = max(1, round(width / downscale)), max(1, round(height / downscale))
+        colour, alpha = downscale_rgba(colour, alpha, w, h)
+        z = None if z is None else resize_nearest(z, w, h)
+        camera = camera.scaled(w, h)
+    return View(
+        frame.name,
+        frame.state,
+        frame.split,
+        camera,
+        torch.from_numpy(np.ascontiguousarray(colour)),
+        torch.from_numpy(np.ascontiguousarray(alpha)),
+        None if z is None else torch.from_numpy(z),
+    )
+
+
+def read_views(frames: Sequence[Frame], report: Report, downscale: float = 1.0, depth: DepthMode = "auto") -> list[View]:
+    """All frames that can be read, in order. Files are decoded by a few threads; findings keep the order of the frames."""
+    import cv2
+
+    cv2.setNumThreads(0)  # the pool below is the parallelism; cv2's own threads would fight it
+
+    def read(frame: Frame):
+        own = Report()
+        return read_view(frame, own, downscale, depth), own
+
+    views = []
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        futures = [pool.submit(read, f) for f in frames]
+        try:
+            for future in futures:
+                view, own = future.result()
+                report.extend(own.findings)
+                if view is not None:
+                    views.append(view)
+        finally:
+            for future in futures:
+                future.cancel()
+    return views
