@@ -1,0 +1,160 @@
+"""The command line: its parser (standard library only) and the way from words to a command of ``p2gs.commands``, with readable errors."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import sys
+from typing import NoReturn
+
+COMMANDS = ("fit", "test", "predict", "export", "view", "data", "bench", "version")
+
+FIT_HELP = """\
+Any option of the config can follow as --key.of.it VALUE; null switches a loss or callback off:
+
+  --data.root DIR  --data.format artgs|dta|paris|synthetic  --phases.articulation.losses.contact null
+  --phases.articulation.losses.part.weight 0.3  --callbacks.previews.every 500
+
+--print_config shows every option with its value. A run that was interrupted goes on when the same command is given again.
+"""
+
+
+class UsageError(Exception):
+    """A command line that cannot be understood, in one sentence."""
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse whose errors are one sentence instead of the usage text."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message} (see {self.prog} --help)")
+
+
+def parser(prog: str = "p2gs") -> Parser:
+    """The parser of all commands."""
+    top = Parser(prog=prog, description="Photographs of an object in two joint states to an articulated digital twin (Part2GS).")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND")
+
+    def add(name: str, text: str, **kwargs) -> Parser:
+        return commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", **kwargs)
+
+    fit = add("fit", "take a scene from images to the finished twin", epilog=FIT_HELP)
+    fit.add_argument("-c", "--config", nargs="+", action="extend", default=[], metavar="FILE", help="YAML files, later ones laid on earlier ones")
+    fit.add_argument("--only", metavar="PHASE", help="run this phase only (its predecessors must be there)")
+    fit.add_argument("--print_config", action="store_true", help="print the merged config with all defaults and stop")
+    fit.add_argument("--plugins", nargs="+", action="extend", default=[], metavar="MODULE", help="modules with losses, callbacks, ... of your own")
+    fit.add_argument("--run", metavar="DIR", help="result folder (default runs/<scene>)")
+    parts = fit.add_mutually_exclusive_group()
+    parts.add_argument("--num_parts", metavar="N", help="number of parts including the static base, or auto (default)")
+    parts.add_argument("--movable", type=int, metavar="N", help="number of moving parts (num_parts - 1)")
+    fit.add_argument("--seed", metavar="N", help="default 0")
+    fit.add_argument("--device", metavar="auto|cpu|cuda", help="default auto")
+    fit.add_argument("--threads", metavar="N", help="CPU threads (default all cores)")
+
+    test = add("test", "score a run against the scene's ground truth and write metrics.json")
+    test.add_argument("run", metavar="RUN", help="result folder of a fit")
+    test.add_argument("--root", metavar="DIR", help="the scene's folder, where it has moved since the fit")
+
+    predict = add("predict", "render a run's twin at any state between start (0) and end (1)")
+    predict.add_argument("run", metavar="RUN", help="result folder of a fit")
+    predict.add_argument("--times", type=float, nargs="+", default=[0.0, 0.25, 0.5, 0.75, 1.0], metavar="T", help="states (default 0 .25 .5 .75 1)")
+    predict.add_argument("--out", metavar="DIR", help="folder for the pictures (default RUN/media/states)")
+    predict.add_argument("--size", type=int, metavar="PX", help="longer side of the pictures")
+    predict.add_argument("--video", action="store_true", help="also a video of the motion")
+
+    export = add("export", "write a run's twin in other formats")
+    export.add_argument("run", metavar="RUN", help="result folder of a fit")
+    export.add_argument("--format", nargs="+", default=["all"], metavar="NAME", help="formats to write (default all)")
+
+    view = add("view", "look at a run's twin in the browser")
+    view.add_argument("run", metavar="RUN", help="result folder of a fit")
+    view.add_argument("--port", type=int, default=8080)
+
+    data = add("data", "check a scene folder or generate a scene")
+    actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
+    check = actions.add_parser("check", help="name the problems of a scene folder", description="Name the problems of a scene folder.")
+    check.add_argument("root", metavar="DIR")
+    check.add_argument("--format", metavar="NAME", help="layout (default: found by looking)")
+    synth = actions.add_parser("synth", help="generate and ray-trace a small scene", description="Generate and ray-trace a small scene.")
+    synth.add_argument("out", metavar="OUT", help="folder to write")
+    synth.add_argument("--seed", type=int, default=0, metavar="S")
+    synth.add_argument("--kind", metavar="NAME", help="kind of object")
+    synth.add_argument("--size", type=int, metavar="PX", help="image size")
+    synth.add_argument("--views", type=int, metavar="N", help="training views a state")
+
+    bench = add("bench", "measure")
+    what = bench.add_subparsers(dest="action", metavar="WHAT", required=True)
+    kernels = what.add_parser("kernels", help="time the rasterizers", description="Time the rasterizers.", add_help=False)
+    kernels.add_argument("words", nargs=argparse.REMAINDER)
+
+    add("version", "print the version")
+    return top
+
+
+def run(words: list[str], prog: str = "p2gs") -> int:
+    """Parse and carry out one command; returns the exit code. Mistakes come as one line ``error: ...`` on stderr."""
+    top = parser(prog)
+    try:
+        args, rest = top.parse_known_args(words)
+        if args.command is None:
+            top.print_help()
+            return 0
+        if rest and args.command != "fit":
+            raise UsageError(f"'{rest[0]}' is no option of {prog} {args.command}{_similar(rest[0], top, args)} (see {prog} {args.command} --help)")
+        return _carry_out(args, rest)
+    except UsageError as err:
+        return _fail(str(err))
+    except SystemExit as err:  # argparse after --help; Lightning turns an interrupt into this
+        if isinstance(err.__context__, KeyboardInterrupt):
+            return _interrupted(prog, words)
+        return err.code if isinstance(err.code, int) else int(err.code is not None)
+    except KeyboardInterrupt:
+        return _interrupted(prog, words)
+    except BrokenPipeError:  # the reader of our output has gone (| head)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _carry_out(args: argparse.Namespace, rest: list[str]) -> int:
+    if args.command == "version":
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(f"p2gs {version('p2gs')}")
+        except PackageNotFoundError:
+            print("p2gs (not installed: run from source)")
+        return 0
+    from p2gs.types import UserError  # from here on torch is loaded
+
+    try:
+        if args.command == "fit":
+            from p2gs.commands.fit import fit
+
+            return fit(args, rest)
+        from p2gs.commands import other
+
+        return getattr(other, args.command)(args)
+    except UserError as err:
+        return _fail(str(err))
+
+
+def _fail(message: str) -> int:
+    print("error: " + " ".join(message.split()), file=sys.stderr)
+    return 2
+
+
+def _interrupted(prog: str, words: list[str]) -> int:
+    go_on = "; give the same command again to go on where it stopped" if words[:1] == ["fit"] else ""
+    print(f"\nstopped{go_on}", file=sys.stderr)
+    return 130
+
+
+def _similar(word: str, top: Parser, args: argparse.Namespace) -> str:
+    commands = next(a for a in top._actions if isinstance(a, argparse._SubParsersAction))
+    known = [option for action in commands.choices[args.command]._actions for option in action.option_strings]
+    close = difflib.get_close_matches(word.split("=")[0], known, n=1)
+    return f" (did you mean '{close[0]}'?)" if close else ""

@@ -1,0 +1,164 @@
+"""Reading config files: where they are looked for, ``include``, strict YAML, command-line overrides, saving."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Optional
+
+import yaml
+
+import p2gs
+from p2gs.schema import Plain, merge, nested
+from p2gs.types import UserError
+
+
+@dataclass
+class Layer:
+    """One config file or the command line. where: what an error message starts with (``configs/x.yaml: `` or nothing)."""
+
+    tree: Plain
+    where: str = ""
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML where a key given twice is an error: the first one would be dropped without a word."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str) and not isinstance(key, (int, float)):
+                raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is no text", key_node.start_mark)
+            if key in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' is given twice", key_node.start_mark)
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def config_folders() -> list[Path]:
+    """Folders of the configs that come with p2gs (installed package, or the source tree)."""
+    package = Path(p2gs.__file__).parent
+    return [folder for folder in (package / "configs", package.parent / "configs") if (folder / "base.yaml").is_file()]
+
+
+def find_config(name: str, beside: Optional[Path] = None) -> Path:
+    """The config file of that name: as given (relative to ``beside``), else among p2gs's own, with or without ``configs/`` and ``.yaml``."""
+    given = Path(name)
+    tries = [(beside / given) if beside else given]
+    inner = Path(*given.parts[1:]) if given.parts and given.parts[0] == "configs" and len(given.parts) > 1 else given
+    tries += [folder / inner for folder in config_folders() if not given.is_absolute()]
+    for path in tries:
+        for candidate in (path, path.with_name(path.name + ".yaml")):
+            if candidate.is_file():
+                return candidate
+    from p2gs.registry import suggest
+
+    known = sorted({str(p.relative_to(f).as_posix()) for f in config_folders() for p in f.rglob("*.yaml")})
+    raise UserError(f"config file '{name}' is not there{suggest(name, known)}")
+
+
+def read_config(name: str, beside: Optional[Path] = None, parents: tuple[Path, ...] = ()) -> list[Layer]:
+    """The layers of a config file: what its ``include`` names first (relative to it), then itself."""
+    path = find_config(name, beside)
+    if path.resolve() in parents:
+        raise UserError(f"{path}: includes itself")
+    try:
+        tree = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)
+    except (yaml.YAMLError, UnicodeDecodeError) as err:
+        mark = getattr(err, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        raise UserError(f"{path}{line}: {getattr(err, 'problem', None) or err}") from err
+    tree = {} if tree is None else tree
+    if not isinstance(tree, dict):
+        raise UserError(f"{path}: expected a mapping (key: value), got {type(tree).__name__}")
+    includes = tree.pop("include", [])
+    layers: list[Layer] = []
+    for include in [includes] if isinstance(includes, str) else includes or []:
+        layers += read_config(str(include), path.parent, (*parents, path.resolve()))
+    return [*layers, Layer(tree, f"{path}: ")]
+
+
+def parse_overrides(words: list[str]) -> list[tuple[str, Any]]:
+    """``--a.b 1 --c=x`` -> ``[("a.b", "1"), ("c", "x")]``. Values stay text, but null, [lists] and {mappings} are read as YAML.
+
+    Raises UserError where a value is missing or a word belongs to no option.
+    """
+    out: list[tuple[str, Any]] = []
+    i = 0
+    while i < len(words):
+        word = words[i]
+        if not word.startswith("--") or len(word) < 3:
+            raise UserError(f"'{word}' belongs to no option (single values are given as --key value, config files as -c FILE)")
+        key, equals, value = word[2:].partition("=")
+        if not equals:
+            if i + 1 >= len(words) or (words[i + 1].startswith("--") and len(words[i + 1]) > 2):
+                raise UserError(f"--{key} needs a value")
+            i += 1
+            value = words[i]
+        out.append((key, _read_value(key, value)))
+        i += 1
+    return out
+
+
+def _read_value(key: str, text: str) -> Any:
+    if text.strip() in ("null", "~") or text.strip()[:1] in ("{", "["):
+        try:
+            return yaml.load(text, Loader=_StrictLoader)
+        except yaml.YAMLError as err:
+            raise UserError(f"--{key}: {text!r} cannot be read ({getattr(err, 'problem', err)})") from err
+    return text
+
+
+def overrides_layer(overrides: list[tuple[str, Any]]) -> Layer:
+    tree: Plain = {}
+    for key, value in overrides:
+        tree = merge(tree, nested(key, value))
+    return Layer(tree)
+
+
+# -- saving ------------------------------------------------------------------------------------------------------------------------
+
+
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data):
+        return True
+
+
+def _represent_list(dumper, data):
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+
+
+_Dumper.add_representer(list, _represent_list)
+
+
+def to_yaml(tree: Plain) -> str:
+    return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=140)
+
+
+def provenance() -> Plain:
+    """Version, git commit (null when not run from a git checkout) and command line of this run."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        number = version("p2gs")
+    except PackageNotFoundError:
+        number = None
+    return {"version": number, "git": _git_commit(), "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}
+
+
+def _git_commit() -> Optional[str]:
+    package = Path(p2gs.__file__).parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", "-C", str(package), *words], capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != package.parent.resolve():
+            return None  # installed inside somebody else's repository
+        return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
