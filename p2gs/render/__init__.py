@@ -1,0 +1,97 @@
+"""Differentiable rasterization of Gaussians: one function, several backends.
+
+Backends live in their own files and register in ``RASTERIZERS``: ``cpu`` (native kernels), ``gsplat`` (CUDA), ``torch_ref``
+(readable reference in torch, any device and dtype). A backend of your own: ``@RASTERIZERS.register("name")`` on a function from
+``RenderInputs`` to ``RenderOutput``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from typing import Optional
+
+from torch import Tensor
+
+from p2gs.native import native, warn_missing_once
+from p2gs.render.base import RASTERIZERS, Rasterizer, RenderInputs, check
+from p2gs.types import RenderOutput, UserError
+
+__all__ = ["RASTERIZERS", "RenderInputs", "find_rasterizer", "rasterize"]
+
+_BUILT_IN = ("cpu", "gsplat", "torch_ref")
+_warned: set[str] = set()
+
+
+def find_rasterizer(name: str) -> Rasterizer:
+    """The backend registered under ``name``. Raises UserError when it is unknown or cannot run here."""
+    if name not in RASTERIZERS and name in _BUILT_IN:
+        importlib.import_module(f"p2gs.render.{name}")
+    return RASTERIZERS[name]
+
+
+def _auto(means: Tensor) -> str:
+    if means.is_cuda:
+        try:
+            find_rasterizer("gsplat")
+            return "gsplat"
+        except UserError as err:
+            if "gsplat" not in _warned:
+                _warned.add("gsplat")
+                warnings.warn(f"{err}: using the slow reference rasterizer in torch", stacklevel=3)
+            return "torch_ref"
+    if means.device.type == "cpu" and native is not None:
+        return "cpu"
+    if means.device.type == "cpu":
+        warn_missing_once()
+    elif means.device.type not in _warned:
+        _warned.add(means.device.type)
+        warnings.warn(f"no fast rasterizer for device '{means.device.type}': using the slow reference rasterizer in torch", stacklevel=3)
+    return "torch_ref"
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    sh_degree: Optional[int] = None,
+    features: Optional[Tensor] = None,
+    background: Optional[Tensor] = None,
+    depth_sq: bool = False,
+    depth_ref: float = 0.0,
+    near: float = 0.01,
+    eps2d: float = 0.3,
+    absgrad: bool = False,
+    median_depth: Optional[bool] = None,
+    backend: str = "auto",
+) -> RenderOutput:
+    """Splat N Gaussians into one view of ``height`` x ``width`` pixels (Kerbl et al. 2023, doi:10.1145/3592433).
+
+    means [N, 3] world; quats [N, 4] wxyz of any length but zero; scales [N, 3] standard deviations; opacities [N] in 0..1;
+    sh [N, B, 3] with B = 1, 4, 9 or 16; viewmat [4, 4] world -> camera, K [3, 3] in pixels (see ``types``), both without gradient.
+    sh_degree: use only the bands up to it.  features [N, F], F <= 16: composited like colour, over nothing.
+    background [3] or [H, W, 3] (default black).  depth_sq: also accumulate (z - depth_ref)^2.
+    near: Gaussians nearer than this (scene units) are culled.  eps2d: variance in pixels^2 added to every projected Gaussian.
+    absgrad: the backward pass fills ``means2d_abs_grad`` [N] = length of (sum |dL/dx|, sum |dL/dy|) over pixels, pixel units
+    (Ye et al. 2024, arXiv:2404.10484).  median_depth: also give the depth where transmittance passes one half; by default only
+    when no gradient is recorded.  backend: a name in ``RASTERIZERS`` or "auto" (cpu or gsplat by device, else torch_ref).
+
+    A Gaussian contributes alpha = min(0.99, opacity exp(-d^T C^-1 d / 2)) where that is at least 1/255; a pixel is finished
+    before its transmittance would fall to 1e-4; colour is max(0, 0.5 + SH(view direction)). A Gaussian with a NaN or infinity in
+    any input is culled and gets zero gradient. Differentiable by means, quats, scales, opacities, sh, features and background.
+
+    Raises ValueError for shapes that do not fit, UserError for a backend that is unknown or cannot run here.
+    """
+    inputs = RenderInputs(
+        means, quats, scales, opacities, sh, viewmat, K, int(width), int(height), -1, features, background,
+        bool(depth_sq), float(depth_ref), float(near), float(eps2d), bool(absgrad), False,
+    )  # fmt: skip
+    check(inputs, sh_degree, median_depth)
+    return find_rasterizer(_auto(means) if backend == "auto" else backend)(inputs)

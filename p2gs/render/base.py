@@ -1,0 +1,89 @@
+"""What every rasterizer gets, and the registry they are found in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Callable, Optional
+
+import torch
+from torch import Tensor
+
+from p2gs.ops.sh import degree_of
+from p2gs.registry import Registry
+from p2gs.types import RenderOutput
+
+ALPHA_MIN = 1 / 255  # a Gaussian fainter than this at a pixel is skipped there
+ALPHA_MAX = 0.99  # and none is more opaque
+T_STOP = 1e-4  # a pixel is finished before its transmittance would fall to this
+FAR = 1e10
+MAX_FEATURES = 16
+
+
+@dataclass
+class RenderInputs:
+    """Checked arguments of ``p2gs.render.rasterize`` (see there); ``sh_degree`` is a number, ``median_depth`` decided."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+    sh_degree: int
+    features: Optional[Tensor]
+    background: Optional[Tensor]
+    depth_sq: bool
+    depth_ref: float
+    near: float
+    eps2d: float
+    absgrad: bool
+    median_depth: bool
+
+
+Rasterizer = Callable[[RenderInputs], RenderOutput]
+RASTERIZERS: Registry[Rasterizer] = Registry("rasterizer")
+
+
+def _expect(name: str, tensor: Tensor, *shape: Optional[int]) -> None:
+    if tensor.dim() != len(shape) or any(want is not None and want != got for want, got in zip(shape, tensor.shape, strict=True)):
+        wanted = ", ".join("any" if s is None else str(s) for s in shape)
+        raise ValueError(f"rasterize: {name} must have shape [{wanted}], got {list(tensor.shape)}")
+
+
+def check(a: RenderInputs, sh_degree: Optional[int], median_depth: Optional[bool]) -> RenderInputs:
+    """The same inputs with their shapes verified and the open choices made. Raises ValueError in one sentence."""
+    _expect("means", a.means, None, 3)
+    n = a.means.shape[0]
+    _expect("quats", a.quats, n, 4)
+    _expect("scales", a.scales, n, 3)
+    _expect("opacities", a.opacities, n)
+    _expect("sh", a.sh, n, None, 3)
+    _expect("viewmat", a.viewmat, 4, 4)
+    _expect("K", a.K, 3, 3)
+    if a.width < 1 or a.height < 1:
+        raise ValueError(f"rasterize: width and height must be at least 1, got {a.width} x {a.height}")
+    available = degree_of(a.sh.shape[1])
+    a.sh_degree = available if sh_degree is None else int(sh_degree)
+    if not 0 <= a.sh_degree <= available:
+        raise ValueError(f"rasterize: sh_degree {sh_degree} needs {(int(sh_degree) + 1) ** 2} coefficients, sh has {a.sh.shape[1]}")
+    if a.features is not None:
+        _expect("features", a.features, n, None)
+        if not 1 <= a.features.shape[1] <= MAX_FEATURES:
+            raise ValueError(f"rasterize: features must have 1 to {MAX_FEATURES} channels, got {a.features.shape[1]}")
+    if a.background is not None and a.background.dim() == 3:
+        _expect("background", a.background, a.height, a.width, 3)
+    elif a.background is not None:
+        _expect("background", a.background, 3)
+    others = (a.quats, a.scales, a.opacities, a.sh, a.features, a.background)
+    for t in others:
+        if t is not None and t.device != a.means.device:
+            raise ValueError(f"rasterize: all tensors must be on one device, got {a.means.device} and {t.device}")
+    if median_depth is None:
+        recorded = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (a.means, *others))
+        a.median_depth = not recorded
+    else:
+        a.median_depth = bool(median_depth)
+    return a
