@@ -22,22 +22,25 @@ def place_repel_points(
     mode: ThresholdMode = "relative",
     noise: float = 0.0,
     generator: torch.Generator | None = None,
+    extent: float | None = None,
 ) -> Tensor:
     """Static points nearer to a movable point than the threshold, ``count`` of them drawn uniformly without repetition: [R, 3].
 
     static_points [S, 3], movable_points [M, 3]: Gaussian centres in one common pose. R = min(count, how many are near); none near
     (or no movable point) gives [0, 3].
-    threshold: a fraction of the diagonal of all points' box ("relative"), a length ("absolute"; the paper says 1.5, which takes in
+    threshold: a fraction of ``extent`` ("relative"; by default the diagonal of all points' box), a length ("absolute"; the paper says 1.5, which takes in
     every point of an object of the benchmarks' size), or a multiple of the static points' median nearest-neighbour distance ("spacing").
-    noise: standard deviation of a Gaussian offset, as a fraction of that diagonal (the paper's sigma_r). No gradient.
+    noise: standard deviation of a Gaussian offset, a length (the paper's sigma_r times the extent). No gradient.
+    Raises ValueError for another mode.
     """
     from scipy.spatial import cKDTree
 
     static, movable = static_points.detach(), movable_points.detach()
     if len(static) == 0 or len(movable) == 0 or count <= 0:
         return static.new_zeros((0, 3))
-    both = torch.cat([static, movable])
-    extent = (both.amax(0) - both.amin(0)).norm().item()
+    if extent is None:
+        both = torch.cat([static, movable])
+        extent = (both.amax(0) - both.amin(0)).norm().item()
     reach = {"relative": lambda: threshold * extent, "absolute": lambda: threshold, "spacing": lambda: threshold * _spacing(static)}
     if mode not in reach:
         raise ValueError(f"threshold mode '{mode}' is not one of {', '.join(reach)}")
@@ -46,7 +49,7 @@ def place_repel_points(
     chosen = near[torch.randperm(len(near), generator=generator)[:count]]
     points = static[chosen.to(static.device)]
     if noise > 0:
-        points = points + noise * extent * torch.randn(points.shape, generator=generator).to(points)
+        points = points + noise * torch.randn(points.shape, generator=generator).to(points)
     return points
 
 

@@ -100,9 +100,9 @@ def test_placement_is_reproducible_and_noise_has_its_size():
     static, movable = cloud(3000, 1).float(), cloud(3000, 2).float()
     draw = lambda noise: place_repel_points(static, movable, 1500, 0.2, noise=noise, generator=torch.Generator().manual_seed(3))  # noqa: E731
     assert (draw(0.0) == draw(0.0)).all()
-    both = torch.cat([static, movable])
-    extent = (both.amax(0) - both.amin(0)).norm()
-    assert ((draw(0.05) - draw(0.0)).std() / extent).item() == pytest.approx(0.05, rel=0.05)
+    assert (draw(0.05) - draw(0.0)).std().item() == pytest.approx(0.05, rel=0.05)
+    half = place_repel_points(static, movable, 10**6, 0.2, extent=0.5)
+    assert len(half) == len(place_repel_points(static, movable, 10**6, 0.1, "absolute"))
     assert len(place_repel_points(static, movable[:0])) == 0
     assert len(place_repel_points(static, movable + 1e3, mode="absolute")) == 0
     with pytest.raises(ValueError, match="threshold mode"):

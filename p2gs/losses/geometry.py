@@ -1,0 +1,48 @@
+"""Losses on rendered depth: ``depth`` and ``depth_variance``."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from p2gs.losses.base import Loss, LossInputs, register_loss
+
+
+@register_loss("depth")
+class Depth(Loss):
+    """mean log(1 + |d - d*|) over the pixels whose depth is known (ArtGS's form). Not in the paper; None without depth maps.
+
+    d is the mean depth of what the ray hits, in the scene's units; pixels that the render covers by less than ``min_alpha`` are
+    left out: their mean depth means little and its gradient is large.
+    """
+
+    weight: float = 0.5
+    min_alpha: float = 0.1
+
+    def compute(self, inputs: LossInputs) -> Tensor | None:
+        render, target = inputs.render, inputs.target
+        if render is None or target is None or target.depth is None:
+            return None
+        valid = (target.depth > 0) & (render.alpha.detach() > self.min_alpha)
+        error = torch.where(valid, (render.expected_depth - target.depth).abs(), torch.zeros_like(target.depth))
+        return error.log1p().sum() / valid.sum().clamp_min(1)
+
+
+@register_loss("depth_variance")
+class DepthVariance(Loss):
+    """2 x mean over the foreground of alpha^2 times the variance of depth along the ray. Not in the paper.
+
+    Gathers what a ray sees at one depth: pictures alone leave textureless surfaces a fog that photometric error cannot see.
+    The foreground is where the photograph's alpha is above one half. The default weight falls from 30 to 10 over its span, in
+    the units of an object of unit size. None where the render carries no squared depth (``RenderOutput.depth_sq``).
+    """
+
+    weight: float = 30.0
+    end_weight: float | None = 10.0
+
+    def compute(self, inputs: LossInputs) -> Tensor | None:
+        render, target = inputs.render, inputs.target
+        if render is None or target is None or render.depth_sq is None:
+            return None
+        inside = (target.alpha > 0.5).to(render.alpha.dtype)
+        return 2 * (render.depth_variance * inside).sum() / inside.sum().clamp_min(1)
