@@ -1,0 +1,238 @@
+"""Learn parts and joints: Gaussians, part embeddings and screws together (paper sections 4.2-4.4, total objective)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from p2gs.losses.base import Loss, LossInputs, PartState
+from p2gs.models.canonical import carry
+from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
+from p2gs.models.motion import PartScrews, blend_move, initial_screws
+from p2gs.models.part_head import PartHead, random_embeddings
+from p2gs.models.phase import exponential, register_phase
+from p2gs.models.repel import place_repel_points
+from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
+from p2gs.models.splats import Splats
+from p2gs.ops import se3, so3
+from p2gs.ops.knn import knn
+from p2gs.types import GaussianTensors
+
+
+@dataclass
+class RepelConfig:
+    """Repel points (paper section 4.3, appendix). count: N_R.  threshold: how near to the static base a movable part must be,
+    by ``threshold_mode`` ("relative" to the box diagonal, "absolute", or in "spacing"s).  noise: standard deviation of their
+    placement, relative to the diagonal. Placed at the start; the callback ``repel`` places them anew (the dynamic variant)."""
+
+    count: int = 2000
+    threshold: float = 0.05
+    threshold_mode: Literal["relative", "absolute", "spacing"] = "relative"
+    noise: float = 0.0
+
+
+@dataclass
+class ArticulationConfig(ImageConfig):
+    """Options of the articulation phase.
+
+    init: "discovery" starts psi, f and xi from the discovered parts; "identity" and "random" (the paper's own) learn from nothing.
+    embedding_dim: of psi.  temperature .. temperature_end: softmax temperature, falling geometrically until ``harden_until``
+    (fraction of the phase); the paper's letter is 1 throughout.  rate_screws: paper 1e-3.  screws_from: fraction of the phase
+    at which screws begin to learn.  neighbours, refresh: k of the neighbourhood KL, and steps between kNN and pair refreshes.
+    pair_target: "matched" holds the pairs of the fusion; "nearest" renews the observed centres by nearest neighbours in each state
+    from ``nearest_from`` (fraction) on.
+    """
+
+    steps: int = 1000
+    levels: list[int] = field(default_factory=lambda: [400])
+    level_starts: list[float] = field(default_factory=lambda: [0.0])
+    init: Literal["discovery", "identity", "random"] = "discovery"
+    embedding_dim: int = 16
+    sureness: float = 4.0
+    temperature: float = 1.0
+    temperature_end: float = 0.1
+    harden_until: float = 0.6
+    rates: SplatRates = field(default_factory=lambda: SplatRates(1e-4, 4e-6, 1.5e-3, 2e-2, 6e-4, 2e-3, 2e-4))
+    rate_embedding: float = 2.5e-2
+    rate_classifier: float = 5e-4
+    rate_screws: float = 1e-4
+    rate_screws_end: float = 1e-6
+    screws_from: float = 0.0
+    neighbours: int = 5
+    refresh: int = 100
+    pair_target: Literal["matched", "nearest"] = "nearest"
+    nearest_from: float = 0.2
+    repel: RepelConfig = field(default_factory=RepelConfig)
+
+
+@register_phase("articulation")
+class ArticulationPhase(ImagePhase):
+    """L = L_render + l_part L_part + l_art L_art + l_phys (L_contact + L_velocity + L_vector), over both states."""
+
+    Config = ArticulationConfig
+
+    def __init__(
+        self,
+        config: ArticulationConfig,
+        losses: dict[str, Loss],
+        canonical: CanonicalGaussians,
+        states: list[StateGaussians],
+        motions: PartMotions | None,
+        num_parts: int,
+        extent: float,
+        views,
+        **common,
+    ):
+        super().__init__(config, losses, views, **common)
+        generator = self.generator(0, 3)
+        self.states = [s.gaussians.means[torch.sigmoid(s.gaussians.opacity_logits) > 0.5] for s in states]
+        self.extent = extent
+        if config.init == "discovery":
+            self.types, transforms, self.confidence = list(motions.types), motions.transforms, motions.confidence
+        else:
+            transforms = initial_screws(config.init, num_parts, generator)
+            self.types, self.confidence = ["free"] * len(transforms), torch.zeros(len(transforms))
+        parts = 1 + len(transforms)
+        self.head = PartHead(config.embedding_dim, parts, generator)
+        if config.init == "discovery":
+            sure = config.sureness * (0.25 + 0.75 * (canonical.margin / canonical.margin.median().clamp_min(1e-6)).clamp(0, 1))
+            psi = self.head.embed(canonical.labels, sure)
+        else:
+            psi = random_embeddings(len(canonical.gaussians), config.embedding_dim, generator)
+        carried = {"paired": canonical.paired, "mu0": canonical.mu0, "mu1": canonical.mu1}
+        self.splats = Splats(canonical.gaussians, extra={"psi": psi}, carried=carried)
+        self.screws = PartScrews(transforms)
+        betas = canonical.betas if len(canonical.betas) == parts else canonical.betas[:1].expand(parts)
+        self.register_buffer("times", (1.0 - betas).float().contiguous())
+        self.register_buffer("repel_points", torch.zeros(0, 3))
+        # the neighbourhood graph is state: a resumed run must use the one of the last refresh
+        self.register_buffer("knn_index", torch.zeros(0, config.neighbours, dtype=torch.int64))
+        self.register_buffer("spacing", torch.zeros(()))
+        self.place_repel_points(0)
+
+    # -- parameters -----------------------------------------------------------------------------------------------------------
+    def parameter_groups(self):
+        rates = self.config.rates.at(0.0)
+        groups = {name: ([getattr(self.splats, name)], rates[name]) for name in rates}
+        groups["psi"] = ([self.splats.psi], self.config.rate_embedding)
+        groups["classifier"] = (list(self.head.parameters()), self.config.rate_classifier)
+        groups["screws"] = ([self.screws.xi], self.config.rate_screws)
+        return groups
+
+    def learning_rates(self, step: int) -> dict[str, float]:
+        fraction = step / max(self.total_steps, 1)
+        screws = exponential(self.config.rate_screws, self.config.rate_screws_end, fraction) if fraction >= self.config.screws_from else 0.0
+        return {**self.config.rates.at(fraction), "screws": screws}
+
+    def temperature(self, step: int) -> float:
+        fraction = step / max(self.total_steps * self.config.harden_until, 1e-9)
+        return exponential(self.config.temperature, self.config.temperature_end, fraction)
+
+    # -- one step -------------------------------------------------------------------------------------------------------------
+    def inputs(self, step: int) -> LossInputs:
+        state = step % 2
+        camera, target = self.target(step // 2, state)
+        g = self.splats.tensors()
+        probs = self.head(self.splats.psi, self.temperature(step))
+        render = self.render(blend_move(g, probs, self.screws.at(state - self.times)), camera, target.background)
+        return LossInputs(step, self.total_steps, g, render, target, camera, self.part_state(step, g, probs), self.loss_cache)
+
+    def part_state(self, step: int, g: GaussianTensors, probs: Tensor) -> PartState:
+        """The losses' view of this step; neighbours and pairs are renewed every ``refresh`` steps."""
+        if step % self.config.refresh == 0 or len(self.knn_index) != len(g):
+            distance, self.knn_index = knn(g.means.detach(), None, min(self.config.neighbours, len(g) - 1), True)
+            self.spacing = distance[:, 0].median()
+            if self.config.pair_target == "nearest" and step >= self.config.nearest_from * self.total_steps:
+                self.renew_pairs(g, probs.detach())
+        pairs = self.splats.paired.nonzero().squeeze(1)
+        mu0, mu1 = self.splats.mu0[pairs], self.splats.mu1[pairs]
+        target_rotation = None
+        if "art" in self.losses and pairs.numel() >= 3:
+            weights = probs.detach()[pairs].T + 1e-9
+            target_rotation = so3.kabsch(mu0.expand(len(weights), -1, 3), mu1.expand(len(weights), -1, 3), weights)[0]
+        hardness = (self.config.temperature - self.temperature(step)) / max(self.config.temperature - self.config.temperature_end, 1e-9)
+        uniform = bool((self.times == self.times[0]).all())
+        return PartState(
+            probs=probs,
+            means_canonical=g.means,
+            transforms=self.screws.transforms(),
+            canonical_time=float(self.times[0]) if uniform else self.times,
+            extent=self.extent,
+            spacing=float(self.spacing),
+            pairs=pairs,
+            mu0=mu0,
+            mu1=mu1,
+            knn=self.knn_index,
+            target_rotation=target_rotation,
+            repel_points=self.repel_points if len(self.repel_points) else None,
+            hardness=hardness,
+        )
+
+    @torch.no_grad()
+    def renew_pairs(self, g: GaussianTensors, probs: Tensor) -> None:
+        """Observed centres anew: nearest solid Gaussian of each single-state reconstruction to where the twin stands now."""
+        labels = probs.argmax(1)
+        found, near = [], torch.ones(len(g), dtype=torch.bool)
+        for state, points in enumerate(self.states):
+            at = carry(g.detach(), labels, self.screws.at(state - self.times)).means
+            distance, index = knn(points, at, 1, False)
+            found.append(points[index[:, 0]])
+            near &= distance[:, 0] <= 3 * distance[:, 0].median()
+        self.splats.mu0, self.splats.mu1, self.splats.paired = found[0].contiguous(), found[1].contiguous(), near
+
+    @torch.no_grad()
+    def place_repel_points(self, step: int) -> None:
+        """Sample repel points on the static base where movable parts are near (state 0)."""
+        g = self.splats.tensors().detach()
+        labels = self.head(self.splats.psi).argmax(1)
+        at = carry(g, labels, self.screws.at(0.0 - self.times)).means
+        static, movable = at[labels == 0], at[labels > 0]
+        r = self.config.repel
+        self.repel_points = torch.zeros(0, 3)
+        if r.count > 0 and min(len(static), len(movable)) > 0:
+            self.repel_points = place_repel_points(
+                static, movable, r.count, r.threshold, r.threshold_mode, r.noise * self.extent, self.generator(step, 4), extent=self.extent
+            )
+
+    def on_load_checkpoint(self, checkpoint) -> None:
+        for name in ("repel_points", "knn_index"):
+            setattr(self, name, torch.empty_like(checkpoint["state_dict"][name]))
+
+    # -- results --------------------------------------------------------------------------------------------------------------
+    @torch.no_grad()
+    def hand_over(self) -> Articulation:
+        """Argmax labels; parts with a canonical time of their own are carried to the common one."""
+        probs = self.head(self.splats.psi, self.config.temperature_end).detach()
+        time = float(self.times[0])
+        g = carry(self.splats.tensors().detach(), probs.argmax(1), self.screws.at(time - self.times))
+        return Articulation(g.clone(), probs, self.types, self.screws.transforms()[1:].double(), self.confidence, time)
+
+    @torch.no_grad()
+    def preview(self, times: list[float]) -> dict[str, Tensor]:
+        from p2gs.ops.palette import part_colours
+
+        g = self.splats.tensors().detach()
+        labels = self.head(self.splats.psi).argmax(1)
+        shot = self.picture(0)
+        colours = part_colours(int(labels.max()) + 1)[labels]
+        strips = {"rgb": [], "parts": []}
+        for t in times:
+            posed = carry(g, labels, self.screws.at(t - self.times))
+            out = render_gaussians(posed, shot.camera, torch.ones(3), features=colours, backend=self.rasterizer)
+            painted = out.features + (1 - out.alpha[..., None])
+            strips["rgb"].append(out.colour)
+            strips["parts"].append(painted)
+        return {f"articulation_{n}": (torch.cat(s, dim=1).clamp(0, 1) * 255).to(torch.uint8) for n, s in strips.items()}
+
+    @torch.no_grad()
+    def summary(self) -> dict[str, float]:
+        mass = self.head(self.splats.psi).mean(0)
+        screw = se3.screw_parameters(self.screws.transforms()[1:].double())
+        values = {f"part_mass/{k}": float(m) for k, m in enumerate(mass)}
+        for k in range(len(self.types)):
+            values[f"joint_{k + 1}/degrees"] = float(screw.angle[k]) * 57.29578
+            values[f"joint_{k + 1}/slide"] = float(screw.translation[k])
+        return values

@@ -1,0 +1,216 @@
+"""The motion-aware canonical field (paper section 4.1): motion richness D, beta, Hungarian matching, fusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from p2gs.models.handover import CanonicalGaussians, PartMotions
+from p2gs.ops import se3, so3
+from p2gs.ops.knn import knn
+from p2gs.types import GaussianTensors, UserError
+
+
+@dataclass
+class CanonicalConfig:
+    """How two single-state reconstructions become one.
+
+    beta: "global" (paper Eq. for beta from motion richness), "uniform" (0.5) or "per_part" (each part its own D; ablation).
+    correspondence: "motion" carries both states to canonical time by the discovered motions before matching; "hungarian" is the
+    paper's letter: raw centres are matched and a pair is joined by a chord. match_size: farthest points per state that are matched.
+    fusion: "union" keeps the Gaussians of the motion-rich state and adds what only the other state saw; "paper" replaces matched
+    Gaussians by beta-weighted averages of all parameters and keeps unmatched ones by ``unmatched``: "static" (those of the
+    motion-rich state that did not move), "none" or "all".
+    min_opacity: fainter Gaussians take no part in D and matching.  trim: fraction of the largest distances left out of D (floaters).
+    """
+
+    beta: str = "global"
+    correspondence: str = "motion"
+    match_size: int = 3000
+    fusion: str = "union"
+    unmatched: str = "static"
+    min_opacity: float = 0.5
+    trim: float = 0.02
+
+
+def motion_richness(a: Tensor, b: Tensor, trim: float = 0.0) -> float:
+    """D^{a->b} = E_i min_j ||a_i - b_j|| (paper Eq. D, unsquared), the largest ``trim`` of the distances left out. a [N, 3], b [M, 3]."""
+    distance = knn(b, a, 1, False)[0][:, 0]
+    keep = max(int(round(len(distance) * (1 - trim))), 1)
+    return float(distance.sort().values[:keep].mean())
+
+
+def beta_weight(d01: float, d10: float) -> float:
+    """beta = D01 / (D01 + D10); 0.5 when nothing moved."""
+    return d01 / (d01 + d10) if d01 + d10 > 0 else 0.5
+
+
+def farthest_points(points: Tensor, count: int) -> Tensor:
+    """Indices [min(count, N)] of farthest-point sampling, started at the point nearest the mean (deterministic)."""
+    n = len(points)
+    if count >= n:
+        return torch.arange(n)
+    picked = torch.empty(count, dtype=torch.int64)
+    picked[0] = (points - points.mean(0)).square().sum(1).argmin()
+    columns = points.T.contiguous()
+    nearest = torch.full((n,), float("inf"))
+    for i in range(1, count):
+        last = columns[:, picked[i - 1]]
+        distance = (columns[0] - last[0]).square_().add_((columns[1] - last[1]).square_()).add_((columns[2] - last[2]).square_())
+        torch.minimum(nearest, distance, out=nearest)
+        picked[i] = nearest.argmax()
+    return picked
+
+
+def hungarian_pairs(a: Tensor, b: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Match farthest points of a [N, 3] and b [M, 3] by least total distance (paper section 4.1). Returns indices (into a, into b)."""
+    from scipy.optimize import linear_sum_assignment
+
+    count = min(count, len(a), len(b))
+    ia, ib = farthest_points(a, count), farthest_points(b, count)
+    rows, cols = linear_sum_assignment(torch.cdist(a[ia].double(), b[ib].double()).numpy())
+    return ia[torch.as_tensor(rows)], ib[torch.as_tensor(cols)]
+
+
+def carry(g: GaussianTensors, labels: Tensor, transforms: Tensor) -> GaussianTensors:
+    """Gaussians moved by the rigid motion of their part. transforms [K, 4, 4], slot 0 included."""
+    T = transforms.to(g.means)
+    R = T[:, :3, :3]
+    means = torch.einsum("nij,nj->ni", R[labels], g.means) + T[labels, :3, 3]
+    quats = so3.quat_multiply(so3.matrix_to_quat(R)[labels], so3.quat_normalize(g.quats))
+    return GaussianTensors(means, quats, g.log_scales, g.opacity_logits, g.sh)
+
+
+def with_static(transforms: Tensor) -> Tensor:
+    """[K-1, 4, 4] -> [K, 4, 4] with the identity in slot 0."""
+    return torch.cat([torch.eye(4, dtype=transforms.dtype)[None], transforms])
+
+
+def blend(a: GaussianTensors, b: GaussianTensors, weight: float | Tensor) -> GaussianTensors:
+    """weight * a + (1 - weight) * b of all stored parameters (weight a float or [N, 1]); quaternions in one hemisphere, normalised."""
+    qa, qb = so3.quat_normalize(a.quats), so3.quat_normalize(b.quats)
+    qb = torch.where((qa * qb).sum(1, keepdim=True) < 0, -qb, qb)
+    w = torch.as_tensor(weight, dtype=a.means.dtype).expand(len(a), 1)
+
+    def mix(x: Tensor, y: Tensor) -> Tensor:
+        shape = [-1] + [1] * (x.dim() - 1)
+        return w.reshape(shape) * x + (1 - w).reshape(shape) * y
+
+    mixed = {n: mix(getattr(a, n), getattr(b, n)) for n in GaussianTensors.NAMES if n != "quats"}
+    return GaussianTensors(quats=so3.quat_normalize(mix(qa, qb)), **mixed)
+
+
+def fuse(g0: GaussianTensors, g1: GaussianTensors, motions: PartMotions | None, config: CanonicalConfig) -> CanonicalGaussians:
+    """Two single-state reconstructions -> one canonical field.
+
+    Without motions (or with ``correspondence: hungarian``) a matched pair becomes beta mu0 + (1-beta) mu1 and remembers its chord.
+    Raises UserError when ``beta: per_part`` is asked for without parts.
+    """
+    solid = [torch.sigmoid(g.opacity_logits) > config.min_opacity for g in (g0, g1)]
+    p0, p1 = g0.means[solid[0]], g1.means[solid[1]]
+    if min(len(p0), len(p1)) < 10:
+        raise UserError(f"canonical_fusion: only {min(len(p0), len(p1))} Gaussians of a state are opaque; expected a reconstructed object (train single_state longer)")
+    d01, d10 = motion_richness(p0, p1, config.trim), motion_richness(p1, p0, config.trim)
+    parts = 1 + (len(motions) if motions is not None else 0)
+    betas = torch.full((parts,), 0.5 if config.beta == "uniform" else beta_weight(d01, d10), dtype=torch.float64)
+    if config.beta == "per_part":
+        if motions is None:
+            raise UserError("canonical_fusion.beta: per_part needs discovered parts (phases.articulation.init: discovery)")
+        for k in range(1, parts):
+            a, b = p0[motions.labels[0][solid[0]] == k], p1[motions.labels[1][solid[1]] == k]
+            if min(len(a), len(b)) >= 10:
+                betas[k] = beta_weight(motion_richness(a, p1, config.trim), motion_richness(b, p0, config.trim))
+    if motions is None or config.correspondence == "hungarian":
+        return _fuse_chords(g0, g1, motions, solid, betas, d01 >= d10, config)
+    return _fuse_motions(g0, g1, motions, solid, betas, d01 >= d10, config)
+
+
+def _fuse_chords(g0, g1, motions, solid, betas, start_is_rich, config) -> CanonicalGaussians:
+    """The paper's letter."""
+    s0, s1 = solid[0].nonzero().squeeze(1), solid[1].nonzero().squeeze(1)
+    i, j = hungarian_pairs(g0.means[s0], g1.means[s1], config.match_size)
+    i, j = s0[i], s1[j]
+    labels = margin = None
+    if motions is not None:
+        labels, margin = motions.labels, motions.margin
+    pairs = blend(g0[i], g1[j], betas[labels[0][i]][:, None] if labels is not None else float(betas[0]))
+    rich, other, own, state = (g0, g1, i, 0) if start_is_rich else (g1, g0, j, 1)
+    rest = _unmatched(rich, other, own, config)
+    kept = rich[rest]
+    n = len(i) + len(kept)
+    g = GaussianTensors.cat([pairs, kept])
+    new_labels, new_margin = torch.zeros(n, dtype=torch.int64), torch.zeros(n)
+    if labels is not None:
+        new_labels = torch.cat([labels[0][i], labels[state][rest]])
+        new_margin = torch.cat([margin[0][i], margin[state][rest]])
+    offsets = torch.zeros(n, 2, 3)
+    offsets[: len(i), 0] = g0.means[i] - pairs.means
+    offsets[: len(i), 1] = g1.means[j] - pairs.means
+    return _with_pairs(g, betas, new_labels, new_margin, torch.arange(len(i)), g0.means[i], g1.means[j], offsets)
+
+
+def _unmatched(rich, other, own, config) -> Tensor:
+    """Which Gaussians of the motion-rich state are kept beside the pairs, [N] bool."""
+    rest = torch.ones(len(rich), dtype=torch.bool)
+    rest[own] = False
+    if config.unmatched == "none":
+        rest[:] = False
+    elif config.unmatched == "static":
+        distance = knn(other.means, rich.means, 1, False)[0][:, 0]
+        rest &= distance < 2 * distance.median().clamp_min(1e-4)
+    return rest
+
+
+def _with_pairs(g, betas, labels, margin, index, mu0, mu1, offsets=None) -> CanonicalGaussians:
+    paired = torch.zeros(len(g), dtype=torch.bool)
+    paired[index] = True
+    both = torch.zeros(2, len(g), 3)
+    both[0, index], both[1, index] = mu0, mu1
+    return CanonicalGaussians(g.clone(), betas, labels, margin, paired, both[0], both[1], offsets)
+
+
+def _fuse_motions(g0, g1, motions, solid, betas, start_is_rich, config) -> CanonicalGaussians:
+    """Carry both states to canonical time along the screws, match there, and join."""
+    T, times = with_static(motions.transforms), 1.0 - betas
+    labels, margin = motions.labels, motions.margin
+    at = [carry(g, labels[s], se3.screw_at(T, times - s)) for s, g in enumerate((g0, g1))]
+    i, j = _match_parts(at, labels, solid, config.match_size)
+    rich, poor = (0, 1) if start_is_rich else (1, 0)
+    own = (i, j)[rich]
+    if config.fusion == "paper":
+        rest = _unmatched(at[rich], at[poor], own, config)
+        pairs = blend(at[0][i], at[1][j], betas[labels[0][i]][:, None])
+        g = GaussianTensors.cat([pairs, at[rich][rest]])
+        index = torch.arange(len(i))
+        new_labels = torch.cat([labels[rich][own], labels[rich][rest]])
+        new_margin = torch.cat([margin[rich][own], margin[rich][rest]])
+    else:
+        spacing = knn(at[rich].means, None, 1, True)[0][:, 0].median()
+        distance = knn(at[rich].means, at[poor].means, 1, False)[0][:, 0]
+        unseen = (distance > 3 * spacing) & (torch.sigmoid(at[poor].opacity_logits) > 0.1)
+        g = GaussianTensors.cat([at[rich], at[poor][unseen]])
+        index = own
+        new_labels = torch.cat([labels[rich], labels[poor][unseen]])
+        new_margin = torch.cat([margin[rich], margin[poor][unseen]])
+    return _with_pairs(g, betas, new_labels, new_margin, index, g0.means[i], g1.means[j])
+
+
+def _match_parts(at, labels, solid, match_size: int) -> tuple[Tensor, Tensor]:
+    """Hungarian pairs of the two states at canonical time, each part by itself, so that no pair joins two parts."""
+    parts = int(max(int(labels[s].max()) for s in (0, 1))) + 1
+    total = max(int(solid[0].sum()), 1)
+    found0, found1 = [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0, dtype=torch.int64)]
+    for k in range(parts):
+        rows = [(solid[s] & (labels[s] == k)).nonzero().squeeze(1) for s in (0, 1)]
+        if min(len(rows[0]), len(rows[1])) < 5:
+            continue
+        share = max(match_size * len(rows[0]) // total, min(300, match_size))
+        i, j = hungarian_pairs(at[0].means[rows[0]], at[1].means[rows[1]], share)
+        i, j = rows[0][i], rows[1][j]
+        gap = (at[0].means[i] - at[1].means[j]).norm(dim=1)
+        close = gap <= 3 * gap.median().clamp_min(1e-4)  # a larger gap: seen in one state only
+        found0.append(i[close])
+        found1.append(j[close])
+    return torch.cat(found0), torch.cat(found1)

@@ -1,0 +1,82 @@
+"""Fuse both states into the motion-aware canonical field and fine-tune its appearance (paper section 4.1, appendix)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from p2gs.losses.base import Loss, LossInputs
+from p2gs.models.canonical import CanonicalConfig, carry, fuse, with_static
+from p2gs.models.handover import CanonicalGaussians, PartMotions, StateGaussians
+from p2gs.models.phase import register_phase
+from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
+from p2gs.models.splats import Splats
+from p2gs.ops import se3
+from p2gs.types import GaussianTensors
+
+
+@dataclass
+class CanonicalFusionConfig(ImageConfig):
+    """Options of fusion and its fine-tuning. steps: paper 5,000. canonical: how the two states are joined."""
+
+    steps: int = 500
+    levels: list[int] = field(default_factory=lambda: [200, 400])
+    level_starts: list[float] = field(default_factory=lambda: [0.0, 0.3])
+    rates: SplatRates = field(default_factory=lambda: SplatRates(2e-4, 2e-5, 2e-3, 2e-2, 1e-3, 2.5e-3, 2.5e-4))
+    canonical: CanonicalConfig = field(default_factory=CanonicalConfig)
+
+
+@register_phase("canonical_fusion")
+class CanonicalFusionPhase(ImagePhase):
+    """Gaussians at canonical time, seen in both states through motions that are held fixed: discovered screws, or matched chords."""
+
+    Config = CanonicalFusionConfig
+
+    def __init__(self, config: CanonicalFusionConfig, losses: dict[str, Loss], states: list[StateGaussians], motions: PartMotions | None, views, **common):
+        super().__init__(config, losses, views, **common)
+        fused = fuse(states[0].gaussians, states[1].gaussians, motions, config.canonical)
+        transforms = motions.transforms if motions is not None else torch.zeros(0, 4, 4).double()
+        carried = {"labels": fused.labels, "margin": fused.margin, "paired": fused.paired, "mu0": fused.mu0, "mu1": fused.mu1}
+        if fused.offsets is not None:
+            carried["offsets"] = fused.offsets
+        self.splats = Splats(fused.gaussians, carried=carried)
+        self.register_buffer("betas", fused.betas)
+        self.register_buffer("transforms", transforms)
+
+    def parameter_groups(self):
+        rates = self.config.rates.at(0.0)
+        return {name: ([getattr(self.splats, name)], rates[name]) for name in rates}
+
+    def learning_rates(self, step: int) -> dict[str, float]:
+        return self.config.rates.at(step / max(self.total_steps, 1))
+
+    def posed(self, state: int) -> GaussianTensors:
+        """The Gaussians at state 0 or 1, with gradients."""
+        g = self.splats.tensors()
+        if hasattr(self.splats, "offsets"):
+            return GaussianTensors(g.means + self.splats.offsets[:, state], g.quats, g.log_scales, g.opacity_logits, g.sh)
+        T = se3.screw_at(with_static(self.transforms), state - (1 - self.betas))
+        return carry(g, self.splats.labels, T)
+
+    def inputs(self, step: int) -> LossInputs:
+        state = step % 2
+        camera, target = self.target(step // 2, state)
+        g = self.posed(state)
+        return LossInputs(step, self.total_steps, self.splats.tensors(), self.render(g, camera, target.background), target, camera, cache=self.loss_cache)
+
+    def hand_over(self) -> CanonicalGaussians:
+        s = self.splats
+        offsets = s.offsets if hasattr(s, "offsets") else None
+        return CanonicalGaussians(s.tensors().clone(), self.betas, s.labels, s.margin, s.paired, s.mu0, s.mu1, offsets)
+
+    @torch.no_grad()
+    def preview(self, times: list[float]) -> dict[str, Tensor]:
+        pictures = []
+        for state in (0, 1):
+            shot = self.picture(state)
+            out = render_gaussians(self.posed(state), shot.camera, torch.ones(3), backend=self.rasterizer)
+            pictures.append(torch.cat([shot.image, out.colour], dim=1))
+        height = min(p.shape[0] for p in pictures)
+        return {f"fusion_state_{s}": (p[:height].clamp(0, 1) * 255).to(torch.uint8) for s, p in enumerate(pictures)}

@@ -1,0 +1,139 @@
+"""From what was learned to the twin: clean labels, drop empty slots, refine the screws with everything frozen, name the joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from p2gs.models.canonical import carry, with_static
+from p2gs.models.handover import Articulation, PartMotions, StateGaussians
+from p2gs.models.part_motions import refine
+from p2gs.models.screw_polish import PolishConfig
+from p2gs.ops import se3, so3
+from p2gs.ops.knn import knn
+from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
+
+
+@dataclass
+class FinishConfig:
+    """Options of the last stage.
+
+    polish: photometric refinement of the screws with hard labels and frozen Gaussians.  min_mass: a slot with a smaller share of the
+    solid Gaussians vanishes.  min_motion: likewise one that moves its points by less (internal units).  prismatic_below: a free motion
+    (paper's start) that turns by less than this many degrees is a slide.  clean_neighbours: labels are the majority among this many
+    neighbours at canonical time (0 = as learned).
+    """
+
+    polish: PolishConfig = field(default_factory=PolishConfig)
+    min_mass: float = 0.002
+    min_motion: float = 0.01
+    prismatic_below: float = 5.0
+    clean_neighbours: int = 8
+
+
+def majority(labels: Tensor, neighbours: Tensor, weights: Tensor, parts: int) -> tuple[Tensor, Tensor]:
+    """Weighted majority of labels [M] over neighbours [N, k] (indices into labels), weights [N, k]: label [N] and its share [N]."""
+    votes = torch.zeros(len(neighbours), parts)
+    votes.scatter_add_(1, labels[neighbours], weights)
+    share, label = votes.max(1)
+    return label, share / votes.sum(1).clamp_min(1e-9)
+
+
+def clean_labels(g: GaussianTensors, labels: Tensor, parts: int, k: int) -> Tensor:
+    """Labels by the opacity-weighted majority of the k nearest Gaussians, each counting itself twice."""
+    if k <= 0 or len(labels) <= k:
+        return labels
+    _, index = knn(g.means, None, k, True)
+    own = torch.arange(len(labels))[:, None]
+    index = torch.cat([own, own, index], dim=1)
+    return majority(labels, index, torch.sigmoid(g.opacity_logits)[index], parts)[0]
+
+
+def surviving_slots(learned: Articulation, labels: Tensor, config: FinishConfig) -> list[int]:
+    """Movable slots with mass and motion, as slot numbers."""
+    solid = torch.sigmoid(learned.gaussians.opacity_logits) > 0.5
+    alive = []
+    for k in range(1, len(learned.types) + 1):
+        rows = solid & (labels == k)
+        mass = float(rows.sum()) / max(float(solid.sum()), 1.0)
+        if mass < config.min_mass:
+            continue
+        points = learned.gaussians.means[rows].double()
+        at = [se3.apply(se3.screw_at(learned.transforms[k - 1], s - learned.canonical_time), points) for s in (0.0, 1.0)]
+        if float((at[1] - at[0]).norm(dim=1).mean()) >= config.min_motion:
+            alive.append(k)
+    return alive
+
+
+def state_labels(learned: Articulation, labels: Tensor, state: StateGaussians, transforms: Tensor, k: int = 6) -> tuple[Tensor, Tensor]:
+    """Labels of a single-state reconstruction by the twin posed in that state; margin = how far the majority exceeds the rest, 0..1."""
+    posed = carry(learned.gaussians, labels, se3.screw_at(with_static(transforms), state.state - learned.canonical_time))
+    solid = (torch.sigmoid(posed.opacity_logits) > 0.1).nonzero().squeeze(1)
+    distance, index = knn(posed.means[solid], state.gaussians.means, k, False)
+    spacing = distance[:, 0].median().clamp_min(1e-4)
+    weights = torch.exp(-(distance / (2 * spacing)).square()) + 1e-9
+    label, share = majority(labels[solid], index, weights, len(transforms) + 1)
+    return label, 2 * share - 1
+
+
+def name_types(types: list[str], transforms: Tensor, below: float) -> list[str]:
+    """Give every "free" motion a joint type by its angle."""
+    angle = so3.rotation_angle(transforms[:, :3, :3]) * 57.29578 if len(transforms) else []
+    return [("prismatic" if float(a) < below else "revolute") if t == "free" else t for t, a in zip(types, angle)]
+
+
+def constrain(kind: str, T: Tensor, centre: Tensor) -> Tensor:
+    """The nearest motion of a joint type: a slide carries ``centre`` where T does, a turn loses its pitch."""
+    if kind == "prismatic":
+        out = torch.eye(4, dtype=T.dtype)
+        out[:3, 3] = T[:3, :3] @ centre + T[:3, 3] - centre
+        return out
+    return se3.project_revolute(T)
+
+
+def finish(
+    learned: Articulation, states: list[StateGaussians], views, config: FinishConfig, similarity: Similarity, *, seed: int, backend: str, report=None
+) -> tuple[ArticulatedObject, list[str]]:
+    """The twin, and one line for each slot that vanished."""
+    labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
+    alive = surviving_slots(learned, labels, config)
+    notes = [f"slot {k} of {len(learned.types)} vanished: no Gaussians of its own, or no motion" for k in range(1, len(learned.types) + 1) if k not in alive]
+    remap = torch.zeros(len(learned.types) + 1, dtype=torch.int64)
+    for new, old in enumerate(alive):
+        remap[old] = new + 1
+    labels = remap[labels]
+    keep = torch.tensor([k - 1 for k in alive], dtype=torch.int64)
+    transforms, confidence = learned.transforms[keep], learned.confidence[keep]
+    types = name_types([learned.types[k - 1] for k in alive], transforms, config.prismatic_below)
+    time = learned.canonical_time
+    for k, kind in enumerate(types):
+        rows = labels == k + 1
+        start = se3.apply(se3.screw_at(transforms[k], -time), learned.gaussians.means[rows].double())
+        transforms[k] = constrain(kind, transforms[k], start.mean(0))
+    if len(types):
+        found = [state_labels(learned, labels, s, transforms) for s in states]
+        motions = PartMotions(types, transforms, confidence, [f[0] for f in found], [f[1] for f in found])
+        transforms = refine(states, motions, views, config.polish, seed=seed, backend=backend).transforms
+    parts = [Part(0, None, int((labels == 0).sum()))]
+    for k, kind in enumerate(types):
+        rows = labels == k + 1
+        centre = learned.gaussians.means[rows].double().mean(0)
+        joint = make_joint(kind, transforms[k], se3.apply(se3.screw_at(transforms[k], -time), centre[None])[0])
+        parts.append(Part(k + 1, joint, int(rows.sum()), float(confidence[k])))
+    return ArticulatedObject(learned.gaussians, labels, parts, time, similarity), notes
+
+
+def make_joint(kind: str, transform: Tensor, centre: Tensor) -> Joint:
+    """A joint from its start -> end motion [4, 4]; ``centre`` [3] is the part's centre at the start (origin of a slide; picks the origin on
+    a hinge's axis nearest to it). The observed motion is the range."""
+    screw = se3.screw_parameters(transform.double())
+    if kind == "prismatic":
+        length = float(transform[:3, 3].norm())
+        axis = transform[:3, 3] / max(length, 1e-12)
+        return Joint("prismatic", axis, centre, length, (0.0, length), transform)
+    axis = screw.axis
+    origin = screw.origin + axis * ((centre - screw.origin) @ axis)
+    degrees = float(screw.angle) * 57.29577951308232
+    return Joint("revolute", axis, origin, degrees, (min(0.0, degrees), max(0.0, degrees)), transform)

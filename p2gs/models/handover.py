@@ -1,0 +1,125 @@
+"""What one phase hands to the next: small named objects, saved as plain tensors (loadable with ``weights_only=True``)."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Optional
+
+import torch
+from torch import Tensor
+
+from p2gs.types import GaussianTensors
+
+
+@dataclass
+class StateGaussians:
+    """A single state reconstructed. state: 0 start, 1 end."""
+
+    state: int
+    gaussians: GaussianTensors
+
+
+@dataclass
+class PartMotions:
+    """The rigid motions of a twin's movable parts, start -> end.
+
+    types: "revolute" or "prismatic" per movable part (part k is entry k - 1).  transforms [K-1, 4, 4] float64.
+    confidence [K-1] in 0..1.  labels: part ids per Gaussian of the start and end reconstruction, int64.  margin: how clearly
+    each label won, per Gaussian of the two states (internal length units; small = ambiguous).
+    """
+
+    types: list[str]
+    transforms: Tensor
+    confidence: Tensor
+    labels: list[Tensor]
+    margin: list[Tensor]
+    diagnostics: dict = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.types)
+
+
+@dataclass
+class CanonicalGaussians:
+    """The fused Gaussians at canonical time t_c = 1 - beta.
+
+    betas [K] float64: one per part, all equal unless ``beta: per_part``.  labels [N], margin [N] as in ``PartMotions`` (zero when
+    no parts were discovered).  paired [N] bool: has an observed centre in both states, mu0 and mu1 [N, 3] (zero elsewhere).
+    offsets [N, 2, 3]: position at state 0 and 1 minus canonical position where no motion is known (the paper's chords), else None.
+    """
+
+    gaussians: GaussianTensors
+    betas: Tensor
+    labels: Tensor
+    margin: Tensor
+    paired: Tensor
+    mu0: Tensor
+    mu1: Tensor
+    offsets: Optional[Tensor] = None
+
+    @property
+    def canonical_times(self) -> Tensor:
+        """[K], per part."""
+        return 1.0 - self.betas
+
+
+@dataclass
+class Articulation:
+    """What the articulation phase learned.
+
+    gaussians at ``canonical_time``; probs [N, K] soft part assignment; motions as in ``PartMotions`` (transforms [K-1, 4, 4] start -> end).
+    """
+
+    gaussians: GaussianTensors
+    probs: Tensor
+    types: list[str]
+    transforms: Tensor
+    confidence: Tensor
+    canonical_time: float
+
+    @property
+    def part_ids(self) -> Tensor:
+        return self.probs.argmax(dim=1)
+
+
+_CLASSES = {c.__name__: c for c in (GaussianTensors, StateGaussians, PartMotions, CanonicalGaussians, Articulation)}
+
+
+def _pack(value):
+    if dataclasses.is_dataclass(value):
+        return {"__class__": type(value).__name__, **{f.name: _pack(getattr(value, f.name)) for f in dataclasses.fields(value)}}
+    if isinstance(value, (list, tuple)):
+        return [_pack(v) for v in value]
+    if isinstance(value, dict):
+        return {k: _pack(v) for k, v in value.items()}
+    if isinstance(value, Tensor):
+        return value.detach().cpu().clone()
+    return value
+
+
+def _unpack(value):
+    if isinstance(value, dict) and "__class__" in value:
+        fields = {k: _unpack(v) for k, v in value.items() if k != "__class__"}
+        return _CLASSES[value["__class__"]](**fields)
+    if isinstance(value, dict):
+        return {k: _unpack(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_unpack(v) for v in value]
+    return value
+
+
+def save(value, path: Path, **header) -> None:
+    """Write a hand-over object atomically (a killed run never leaves half a file)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    torch.save({"header": header, "value": _pack(value)}, part)
+    os.replace(part, path)
+
+
+def load(path: Path):
+    """Returns (value, header)."""
+    stored = torch.load(path, weights_only=True)
+    return _unpack(stored["value"]), stored["header"]

@@ -1,0 +1,48 @@
+"""SE(3) per part as screws xi, and how soft part assignments move Gaussians (paper appendix, part assignment)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from p2gs.models.canonical import with_static
+from p2gs.ops import se3, so3
+from p2gs.types import GaussianTensors
+
+
+class PartScrews(nn.Module):
+    """xi [K-1, 6]: full start -> end screws of the movable parts; slot 0 is the static base. Stored in float32."""
+
+    def __init__(self, transforms: Tensor):
+        super().__init__()
+        self.xi = nn.Parameter(se3.log(transforms.double()).float())
+
+    def transforms(self) -> Tensor:
+        """[K, 4, 4], identity in slot 0."""
+        return with_static(se3.exp(self.xi))
+
+    def at(self, span: Tensor) -> Tensor:
+        """Motions exp(span_k xi_k) of slots 0..K-1, [K, 4, 4]; span [K] (state time minus canonical time)."""
+        return with_static(se3.exp(self.xi * span[1:, None].to(self.xi)))
+
+
+def initial_screws(kind: str, parts: int, generator: torch.Generator) -> Tensor:
+    """Start transforms [K-1, 4, 4]: "identity" (with noise of 0.01) or "random" (paper section 4.3: random rotations, small translations)."""
+    noise = torch.randn(parts - 1, 6, generator=generator)
+    if kind == "identity":
+        return se3.exp(1e-2 * noise)
+    T = torch.eye(4).repeat(parts - 1, 1, 1)
+    T[:, :3, :3] = so3.quat_to_matrix(so3.quat_normalize(torch.randn(parts - 1, 4, generator=generator)))
+    T[:, :3, 3] = 0.1 * noise[:, 3:]
+    return T
+
+
+def blend_move(g: GaussianTensors, probs: Tensor, transforms: Tensor) -> GaussianTensors:
+    """mu' = sum_k p_k (R_k mu + t_k); rotations by the p-weighted, sign-aligned quaternions. probs [N, K], transforms [K, 4, 4]."""
+    n, k = probs.shape
+    mixed = (probs @ transforms[:, :3].reshape(k, 12)).reshape(n, 3, 4)
+    means = (mixed[:, :, :3] @ g.means[:, :, None])[..., 0] + mixed[:, :, 3]
+    turns = so3.matrix_to_quat(transforms[:, :3, :3])
+    turns = torch.where((turns * turns[:1]).sum(1, keepdim=True) < 0, -turns, turns)
+    quats = so3.quat_multiply(so3.quat_normalize(probs @ turns), so3.quat_normalize(g.quats))
+    return GaussianTensors(means, quats, g.log_scales, g.opacity_logits, g.sh)

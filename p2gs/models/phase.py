@@ -1,0 +1,166 @@
+"""What every training phase shares: manual optimisation, loss bookkeeping, step-addressed randomness, resumable state."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset
+
+from p2gs.losses.base import Loss, LossInputs
+from p2gs.models.adam import NamedAdam
+from p2gs.models.splats import Splats
+from p2gs.registry import Registry
+from p2gs.types import UserError
+
+PHASES: Registry[type["Phase"]] = Registry("phase")
+
+
+def register_phase(name: str):
+    """Decorator: register a phase and tell it its name."""
+
+    def wrap(cls: type["Phase"]) -> type["Phase"]:
+        cls.phase_name = name
+        return PHASES.register(name)(cls)
+
+    return wrap
+
+
+@dataclass
+class PhaseConfig:
+    """Fields every phase has. steps: optimiser steps."""
+
+    steps: int = 1000
+
+
+class _Steps(IterableDataset):
+    """Endless: a phase chooses its view from (seed, step), so a batch says nothing."""
+
+    def __iter__(self):
+        return itertools.repeat(0)
+
+
+def endless_steps() -> DataLoader:
+    """The loader of every phase's Trainer: it only ticks, ``max_steps`` ends it."""
+    return DataLoader(_Steps(), batch_size=None, num_workers=0)
+
+
+def exponential(start: float, end: float, fraction: float) -> float:
+    """start at 0, end at 1, geometric between (both > 0)."""
+    return math.exp(math.log(start) + (math.log(end) - math.log(start)) * min(max(fraction, 0.0), 1.0))
+
+
+class Phase(LightningModule):
+    """One training phase. Owns its Gaussians, rasterizer and whatever else it learns; hands over a small saved object.
+
+    Subclasses give ``parameter_groups`` (name -> (tensors, learning rate)), ``learning_rates(step)`` and ``inputs(step)``; the
+    sum of the losses on those inputs is minimised with one Adam. Which losses are on is the config's business.
+
+    losses: name -> Loss.  scalars: latest detached values by name, for callbacks to log.  seed: makes every random choice a
+    pure function of (seed, step), so that a resumed run goes the same way.
+    """
+
+    Config: type[PhaseConfig] = PhaseConfig
+    phase_name = "phase"
+
+    def __init__(self, config: PhaseConfig, losses: dict[str, Loss], *, seed: int = 0, rasterizer: str = "auto"):
+        super().__init__()
+        self.automatic_optimization = False
+        self.config = config
+        self.losses = losses
+        self.seed = seed
+        self.rasterizer = rasterizer
+        self.splats: Splats
+        self.scalars: dict[str, Tensor | float] = {}
+        self.loss_cache: dict = {}
+        self.track_gradients = False  # set by the densification callback
+
+    # -- what a subclass gives ------------------------------------------------------------------------------------------------
+    def parameter_groups(self) -> dict[str, tuple[list[Tensor], float]]:
+        """name -> (parameters, learning rate at step 0)."""
+        raise NotImplementedError
+
+    def learning_rates(self, step: int) -> dict[str, float]:
+        """Learning rates that change with the step; groups not named keep theirs."""
+        return {}
+
+    def inputs(self, step: int) -> LossInputs:
+        """Render what this step looks at."""
+        raise NotImplementedError
+
+    def hand_over(self) -> Any:
+        """The result of the phase, a dataclass of ``models.handover``."""
+        raise NotImplementedError
+
+    def preview(self, times: list[float]) -> dict[str, Tensor]:
+        """Pictures by name, uint8 [H, W, 3]."""
+        return {}
+
+    def summary(self) -> dict[str, float]:
+        """Numbers worth plotting that are no losses (joint parameters, part masses)."""
+        return {}
+
+    # -- what all share -------------------------------------------------------------------------------------------------------
+    @property
+    def step(self) -> int:
+        """Optimiser steps done."""
+        return self.global_step
+
+    @property
+    def total_steps(self) -> int:
+        return self.config.steps
+
+    @property
+    def num_gaussians(self) -> int:
+        return len(self.splats)
+
+    def generator(self, step: int, purpose: int = 0) -> torch.Generator:
+        """A generator that depends on (seed, phase, step, purpose) only."""
+        name = sum((i + 1) * ord(c) for i, c in enumerate(self.phase_name))
+        return torch.Generator().manual_seed(((self.seed * 1_000_003 + name) * 1_000_003 + step) * 31 + purpose)
+
+    def configure_optimizers(self):
+        groups = [{"params": list(params), "lr": lr, "name": name} for name, (params, lr) in self.parameter_groups().items()]
+        return NamedAdam([g for g in groups if g["params"]], eps=1e-15)
+
+    def total_loss(self, inputs: LossInputs) -> Tensor:
+        """Weighted sum of the active losses; fills ``scalars``. Raises UserError when no loss applies."""
+        total = None
+        for name, loss in self.losses.items():
+            value = loss(inputs)
+            if value is None:
+                continue
+            self.scalars[f"loss/{name}"] = value.detach()
+            total = value if total is None else total + value
+        if total is None or not total.requires_grad:
+            on = ", ".join(self.losses) or "none"
+            raise UserError(f"phases.{self.phase_name}.losses: no loss applies at step {inputs.step} (switched on: {on}); expected at least 'render'")
+        self.scalars["loss/total"] = total.detach()
+        return total
+
+    def training_step(self, batch, batch_idx):
+        step = self.step
+        optimizer = self.optimizers()
+        rates = self.learning_rates(step)
+        for group in optimizer.param_groups:
+            if group["name"] in rates:
+                group["lr"] = rates[group["name"]]
+        inputs = self.inputs(step)
+        optimizer.zero_grad(set_to_none=True)
+        self.total_loss(inputs).backward()
+        if self.track_gradients and inputs.render is not None and inputs.render.means2d_abs_grad is not None:
+            # in units of the full image, so that levels of the resolution schedule weigh alike
+            self.splats.note_gradients(inputs.render.means2d_abs_grad, inputs.render.radii, float(inputs.render.alpha.shape[0]))
+        self.constrain_gradients()
+        optimizer.step()
+
+    def constrain_gradients(self) -> None:
+        """Hook between backward and the optimiser's step."""
+
+    def train_dataloader(self):
+        return endless_steps()

@@ -1,0 +1,223 @@
+"""Reconstruct one joint state: 3D Gaussian splatting (paper section 3; Kerbl et al. 2023, DOI 10.1145/3592433) made for minutes on a CPU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from p2gs.data.views import TrainingViews, view_index
+from p2gs.losses.base import Loss, LossInputs, Target
+from p2gs.models.handover import StateGaussians
+from p2gs.models.phase import Phase, PhaseConfig, exponential, register_phase
+from p2gs.models.splats import Splats
+from p2gs.render import rasterize
+from p2gs.types import Camera, GaussianTensors, RenderOutput, TwoStateScene
+
+
+@dataclass
+class ImageConfig(PhaseConfig):
+    """Options of every phase that renders views.
+
+    levels: image sizes in pixels (long edge), coarse to fine; level_starts: fraction of the phase at which each begins. An image
+    smaller than a level is used as it is. background: colour behind the object while training ("random" changes every step).
+    """
+
+    levels: list[int] = field(default_factory=lambda: [100, 200, 400])
+    level_starts: list[float] = field(default_factory=lambda: [0.0, 0.1, 0.35])
+    background: str = "random"
+
+
+@dataclass
+class SplatRates:
+    """Learning rates of Gaussian parameters (internal units: the object's box has a diagonal of 2).
+
+    Means decay geometrically to ``means_end``; the others to a tenth over the last 30 % of the phase.
+    """
+
+    means: float = 4e-4
+    means_end: float = 4e-6
+    log_scales: float = 5e-3
+    opacity_logits: float = 5e-2
+    quats: float = 2e-3
+    sh0: float = 5e-3
+    sh_rest: float = 5e-4
+
+    def at(self, fraction: float) -> dict[str, float]:
+        tail = exponential(1.0, 0.1, (fraction - 0.7) / 0.3)
+        rates = {n: getattr(self, n) * tail for n in ("log_scales", "opacity_logits", "quats", "sh0", "sh_rest")}
+        return {"means": exponential(self.means, self.means_end, fraction), **rates}
+
+
+@dataclass
+class SingleStateConfig(ImageConfig):
+    """Options of the single-state phase.
+
+    steps: paper 30,000.  initial_gaussians: random points in the object's box (or depth points where ``init`` says so).
+    sh_degree: 0-3.  sh_every: steps until the next degree is switched on.  init: "auto" takes depth points where the scene has
+    depth, "random" never does.  initial_opacity: low, so that concavities stay open until the images fill them.
+    """
+
+    steps: int = 6000
+    initial_gaussians: int = 10000
+    initial_opacity: float = 0.1
+    init: str = "auto"
+    sh_degree: int = 1
+    sh_every: int = 500
+    rates: SplatRates = field(default_factory=SplatRates)
+
+
+class ImagePhase(Phase):
+    """A phase that renders training views of one or both states."""
+
+    def __init__(self, config: ImageConfig, losses: dict[str, Loss], views: dict[int, TrainingViews], **common):
+        super().__init__(config, losses, **common)
+        self.views = views
+
+    def level(self, step: int) -> int:
+        """Image size (long edge) at a step."""
+        fraction = step / max(self.total_steps, 1)
+        level = self.config.levels[0]
+        for size, start in zip(self.config.levels, self.config.level_starts):
+            if fraction >= start:
+                level = size
+        return level
+
+    def background(self, step: int) -> Tensor:
+        """[3], by the config."""
+        if self.config.background == "random":
+            return torch.rand(3, generator=self.generator(step, 1))
+        return torch.full((3,), {"white": 1.0, "black": 0.0, "grey": 0.5}[self.config.background])
+
+    def target(self, step: int, state: int) -> tuple[Camera, Target]:
+        """The photograph of this step: camera and target of one training view of ``state``."""
+        views = self.views[state]
+        background = self.background(step)
+        picked = views.get(view_index(self.seed + 7919 * state, step, len(views)), views.levels.index(self.level(step)), background)
+        # the same view recurs with other backgrounds: statistics of the target may be cached only where it does not change
+        key = picked.key if self.config.background != "random" else None
+        return picked.camera, Target(picked.image, picked.alpha, background, picked.depth, key)
+
+    def picture(self, state: int):
+        """The first training view of a state on white, at the finest level: what previews show."""
+        views = self.views[state]
+        return views.get(0, views.levels.index(self.config.levels[-1]), torch.ones(3))
+
+    def render(self, g: GaussianTensors, camera: Camera, background: Tensor, sh_degree: int | None = None) -> RenderOutput:
+        return render_gaussians(
+            g,
+            camera,
+            background,
+            sh_degree=sh_degree,
+            depth_sq=self._active("depth_variance"),
+            absgrad=self.track_gradients,
+            backend=self.rasterizer,
+        )
+
+    def _active(self, name: str) -> bool:
+        return name in self.losses and self.losses[name].active(self.step, self.total_steps)
+
+
+def render_gaussians(g: GaussianTensors, camera: Camera, background: Tensor | None = None, **options) -> RenderOutput:
+    """``render.rasterize`` of stored parameters; depth moments are taken about the distance of the origin (the box's centre)."""
+    return rasterize(
+        g.means,
+        g.quats,
+        g.log_scales.exp(),
+        torch.sigmoid(g.opacity_logits),
+        g.sh,
+        camera.viewmat,
+        camera.K,
+        camera.width,
+        camera.height,
+        background=background,
+        depth_ref=float(camera.viewmat[2, 3]),
+        **options,
+    )
+
+
+@register_phase("single_state")
+class SingleStatePhase(ImagePhase):
+    """3DGS of one state: L_render (paper Eq. 4) plus the losses the config names. Runs once for each state."""
+
+    Config = SingleStateConfig
+
+    def __init__(self, config: SingleStateConfig, losses: dict[str, Loss], scene: TwoStateScene, state: int, views: TrainingViews, **common):
+        super().__init__(config, losses, {state: views}, **common)
+        self.state = state
+        self.seed = self.seed * 2 + state
+        points, colours = initial_points(scene, state, config, self.generator(0, 2))
+        self.splats = Splats(isotropic_gaussians(points, colours, config.initial_opacity, config.sh_degree))
+
+    def parameter_groups(self):
+        rates = self.config.rates.at(0.0)
+        return {name: ([getattr(self.splats, name)], rates[name]) for name in rates}
+
+    def learning_rates(self, step: int) -> dict[str, float]:
+        return self.config.rates.at(step / max(self.total_steps, 1))
+
+    def inputs(self, step: int) -> LossInputs:
+        camera, target = self.target(step, self.state)
+        g = self.splats.tensors()
+        degree = min(self.config.sh_degree, step // max(self.config.sh_every, 1))
+        render = self.render(g, camera, target.background, degree)
+        return LossInputs(step, self.total_steps, g, render, target, camera, cache=self.loss_cache)
+
+    def hand_over(self) -> StateGaussians:
+        return StateGaussians(self.state, self.splats.tensors().clone())
+
+    @torch.no_grad()
+    def preview(self, times: list[float]) -> dict[str, Tensor]:
+        shot = self.picture(self.state)
+        out = render_gaussians(self.splats.tensors(), shot.camera, torch.ones(3), backend=self.rasterizer)
+        both = torch.cat([shot.image, out.colour], dim=1)
+        return {f"state_{self.state}": (both.clamp(0, 1) * 255).to(torch.uint8)}
+
+
+def initial_points(scene: TwoStateScene, state: int, config: SingleStateConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Points [N, 3] and colours [N, 3] to start from: depth points where allowed and present, else random in the box."""
+    n = config.initial_gaussians
+    if config.init == "auto" and scene.has_depth:
+        points, colours = depth_points(scene.select(state=state, split="train"), n, generator)
+        if len(points) > 100:
+            return points, colours
+    low, high = scene.box
+    return low + torch.rand(n, 3, generator=generator) * (high - low), torch.full((n, 3), 0.5)
+
+
+def depth_points(views, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """``count`` pixels with known depth, back-projected: points [N, 3] and colours [N, 3]."""
+    points, colours = [], []
+    per_view = -(-count // max(len(views), 1))
+    for view in views:
+        rows, cols = ((view.depth > 0) & (view.alpha > 250)).nonzero(as_tuple=True)
+        if rows.numel() == 0:
+            continue
+        pick = torch.randint(rows.numel(), (per_view,), generator=generator)
+        rows, cols = rows[pick], cols[pick]
+        pixels = torch.stack([cols + 0.5, rows + 0.5, torch.ones(per_view)], dim=1)
+        rays = pixels @ torch.linalg.inv(view.camera.K).T
+        local = rays * view.depth[rows, cols, None]
+        R, t = view.camera.viewmat[:3, :3], view.camera.viewmat[:3, 3]
+        points.append((local - t) @ R)
+        colours.append(view.image[rows, cols].float() / 255)
+    if not points:
+        return torch.zeros(0, 3), torch.zeros(0, 3)
+    return torch.cat(points)[:count], torch.cat(colours)[:count]
+
+
+def isotropic_gaussians(points: Tensor, colours: Tensor, opacity: float, sh_degree: int) -> GaussianTensors:
+    """Round Gaussians as large as the mean distance to their three nearest neighbours."""
+    from p2gs.ops.knn import knn
+    from p2gs.ops.sh import rgb_to_dc
+
+    n = len(points)
+    distance, _ = knn(points, None, min(3, n - 1), True)
+    log_scales = distance.mean(dim=1).clamp(1e-4, 0.2).log()[:, None].expand(n, 3).contiguous()
+    sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
+    sh[:, 0] = rgb_to_dc(colours)
+    quats = torch.zeros(n, 4)
+    quats[:, 0] = 1
+    logit = torch.logit(torch.tensor(opacity)).expand(n).contiguous()
+    return GaussianTensors(points.contiguous(), quats, log_scales, logit, sh)

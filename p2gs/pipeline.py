@@ -1,0 +1,281 @@
+"""Runs the stages in order, hands over, skips what is done, goes on where a run stopped.
+
+Each stage leaves RUN/checkpoints/<stage>.pt with a key: a hash of all that decides its result, the key of the stages before it
+included. A stage whose file has the right key is not run again; a training stage that was interrupted goes on from <stage>.ckpt.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import resource
+import time
+from pathlib import Path
+from typing import Any, Callable, Optional
+
+import torch
+
+from p2gs.config import RunConfig, save_config
+from p2gs.data.views import TrainingViews
+from p2gs.models import handover
+from p2gs.models.articulation import ArticulationPhase
+from p2gs.models.canonical_fusion import CanonicalFusionPhase
+from p2gs.models.finish import FinishConfig, finish
+from p2gs.models.part_motions import PartMotionsConfig, find_part_motions
+from p2gs.models.phase import PHASES, Phase
+from p2gs.models.single_state import SingleStatePhase
+from p2gs.types import ArticulatedObject, TwoStateScene, UserError
+
+STAGES = ("single_state", "discovery", "canonical_fusion", "articulation", "finish")
+
+
+@PHASES.register("discovery")
+class DiscoveryStage:
+    """Not trained: ``models.part_motions``."""
+
+    Config = PartMotionsConfig
+
+
+@PHASES.register("finish")
+class FinishStage:
+    """Not trained: ``models.finish``."""
+
+    Config = FinishConfig
+
+
+def run(cfg: RunConfig, only: Optional[str] = None) -> Path:
+    """All stages of a run, or the one named ``only`` (anew; those before it must be there). Returns the result folder."""
+    return Pipeline(cfg).run(only)
+
+
+class Pipeline:
+    """One run: its scene, its views, its stages."""
+
+    def __init__(self, cfg: RunConfig):
+        self.cfg = cfg
+        self.run_dir = cfg.run_dir
+        self.device = pick_device(cfg.device)
+        if cfg.threads:
+            torch.set_num_threads(cfg.threads)
+        missing = [name for name in STAGES if name not in cfg.phases]
+        if missing:
+            raise UserError(f"phases.{missing[0]} is not in the config; expected all of {', '.join(STAGES)} (start from -c configs/preset/cpu.yaml)")
+        self.init = cfg.phases["articulation"].config.init
+        if self.init != "discovery" and cfg.num_parts == "auto":
+            raise UserError(f"num_parts: auto needs phases.articulation.init: discovery (it is '{self.init}'); give --num_parts N")
+        self._views: Optional[dict[int, TrainingViews]] = None
+        self.times: dict[str, dict] = {}
+
+    # -- what stages share ----------------------------------------------------------------------------------------------------
+    @property
+    def scene(self) -> TwoStateScene:
+        return self.cfg.data.scene()
+
+    @property
+    def views(self) -> dict[int, TrainingViews]:
+        """Training views of both states, at every size a stage asks for; made once."""
+        if self._views is None:
+            sizes: set[int] = set()
+            for name in STAGES:
+                sizes |= _levels(self.cfg.phases[name].config)
+            self._views = {}
+            for state in (0, 1):
+                views = self.scene.select(state=state, split="train")
+                if not views:
+                    raise UserError(f"{self.scene.name}: there are no training views of state {state}; expected photographs of both states")
+                self._views[state] = TrainingViews(views, sorted(sizes))
+        return self._views
+
+    def key(self, stage: str) -> str:
+        """Hash of all that decides a stage's result."""
+        cfg = self.cfg
+        common = {n: cfg.section(n) for n in ("seed", "num_parts", "rasterizer")} | {"data": cfg.section("data"), "device": self.device.type}
+        if stage.startswith("single_state"):
+            del common["num_parts"]
+        chain = [common]
+        for name in STAGES:
+            if name == "discovery" and self.init != "discovery":
+                continue
+            chain.append({name: cfg.section(name)})
+            if stage.startswith(name):
+                break
+        return hashlib.sha256(json.dumps([stage, chain], sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+    def file(self, stage: str) -> Path:
+        return self.run_dir / "checkpoints" / f"{stage}.pt"
+
+    def done(self, stage: str) -> Any:
+        """The stage's result, or None when it is not there or of another config."""
+        if not self.file(stage).exists():
+            return None
+        try:
+            value, header = handover.load(self.file(stage))
+        except Exception as err:
+            raise UserError(f"{self.file(stage)} cannot be read ({err}); delete it to run that stage again") from err
+        if stage == "finish" and not (self.run_dir / "twin.json").exists():
+            return None
+        return value if header.get("key") == self.key(stage) else None
+
+    # -- the order ------------------------------------------------------------------------------------------------------------
+    def run(self, only: Optional[str] = None) -> Path:
+        self.run_dir.mkdir(parents=True, exist_ok=True)
+        save_config(self.cfg, self.run_dir / "config.yaml")
+        states = [self.stage(f"single_state_{s}", only, lambda s=s: self.train(f"single_state_{s}", "single_state", lambda c: self.single_state(s, c))) for s in (0, 1)]
+        if only == "single_state":
+            return self.run_dir
+        motions = self.stage("discovery", only, lambda: self.discover(states)) if self.init == "discovery" else None
+        if only == "discovery":
+            return self.run_dir
+        canonical = self.stage("canonical_fusion", only, lambda: self.train("canonical_fusion", "canonical_fusion", lambda c: self.fusion(states, motions, c)))
+        if only == "canonical_fusion":
+            return self.run_dir
+        learned = self.stage("articulation", only, lambda: self.train("articulation", "articulation", lambda c: self.articulate(canonical, states, motions, c)))
+        if only == "articulation":
+            return self.run_dir
+        self.stage("finish", only, lambda: self.write(learned, states))
+        return self.run_dir
+
+    def stage(self, name: str, only: Optional[str], make: Callable[[], Any]) -> Any:
+        """The result of a stage: from its file, or made and saved now."""
+        wanted = only is not None and name.startswith(only)
+        value = self.done(name)
+        if value is not None and not wanted:
+            print(f"{name}: done before, unchanged", flush=True)
+            return value
+        if only is not None and not wanted:
+            raise UserError(f"--only {only}: the stage '{name}' before it is not there or its config has changed; run without --only first")
+        began = time.perf_counter()
+        value = make()
+        seconds = time.perf_counter() - began
+        handover.save(value, self.file(name), key=self.key(name))
+        (self.run_dir / "checkpoints" / f"{name}.ckpt").unlink(missing_ok=True)
+        self.note_time(name, seconds)
+        return value
+
+    def note_time(self, name: str, seconds: float) -> None:
+        """RUN/logs/stages.json: seconds and peak memory (MiB) of each stage; of a resumed one the last sitting."""
+        path = self.run_dir / "logs" / "stages.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        times = json.loads(path.read_text()) if path.exists() else {}
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        times[name] = {"seconds": round(seconds, 2), "peak_memory_mib": peak}
+        path.write_text(json.dumps(times, indent=1))
+        print(f"{name}: {seconds:.1f} s, peak memory {peak} MiB", flush=True)
+
+    # -- stages ---------------------------------------------------------------------------------------------------------------
+    def common(self) -> dict:
+        return {"seed": self.cfg.seed, "rasterizer": self.cfg.rasterizer}
+
+    def single_state(self, state: int, section) -> Phase:
+        return SingleStatePhase(section.config, section.losses, self.scene, state, self.views[state], **self.common())
+
+    def discover(self, states) -> handover.PartMotions:
+        return find_part_motions(
+            states,
+            self.scene,
+            self.views,
+            self.cfg.num_parts,
+            self.cfg.phases["discovery"].config,
+            seed=self.cfg.seed,
+            backend=self.cfg.rasterizer,
+            report=lambda *text: print("discovery:", *text, flush=True),
+        )
+
+    def fusion(self, states, motions, section) -> Phase:
+        return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, **self.common())
+
+    def articulate(self, canonical, states, motions, section) -> Phase:
+        extent = float((self.scene.box[1] - self.scene.box[0]).norm())
+        parts = len(motions) + 1 if motions is not None else self.cfg.num_parts
+        return ArticulationPhase(section.config, section.losses, canonical, states, motions, parts, extent, self.views, **self.common())
+
+    def train(self, stage: str, phase_name: str, build: Callable[[Any], Phase]) -> Any:
+        """One training phase with a Trainer of its own."""
+        from lightning.pytorch import Trainer, seed_everything
+        from lightning.pytorch.loggers import TensorBoardLogger
+
+        section = self.cfg.phases[phase_name]
+        seed_everything(self.cfg.seed, verbose=False)
+        phase = build(section)
+        phase.phase_name = stage
+        key = self.key(stage)
+        phase.save_hyperparameters({"stage": stage, "key": key})
+        callbacks = section.new_callbacks()
+        order = sorted(callbacks, key=lambda n: (not callbacks[n].changes_result, n == "checkpoint"))
+        if phase.total_steps <= 0:
+            return phase.hand_over()
+        trainer = Trainer(
+            max_steps=phase.total_steps,
+            max_epochs=-1,
+            accelerator="gpu" if self.device.type == "cuda" else "cpu",
+            devices=1,
+            logger=TensorBoardLogger(self.run_dir / "logs", name=stage, version=""),
+            callbacks=[callbacks[n] for n in order],
+            default_root_dir=self.run_dir,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            enable_checkpointing=False,
+            num_sanity_val_steps=0,
+        )
+        trainer.fit(phase, ckpt_path=self.resumable(stage, key), weights_only=True)
+        if trainer.global_step < phase.total_steps:
+            raise KeyboardInterrupt
+        return phase.cpu().hand_over()
+
+    def resumable(self, stage: str, key: str) -> Optional[str]:
+        """The training state an interrupted stage goes on from, when it is of this very config."""
+        path = self.run_dir / "checkpoints" / f"{stage}.ckpt"
+        if not path.exists():
+            return None
+        try:
+            stored = torch.load(path, weights_only=True)["hyper_parameters"]
+        except Exception:
+            print(f"{stage}: {path} cannot be read; starting this stage anew", flush=True)
+            return None
+        if stored.get("key") != key:
+            return None
+        print(f"{stage}: going on from {path}", flush=True)
+        return str(path)
+
+    def write(self, learned: handover.Articulation, states) -> dict:
+        """The twin and the result folder; returns what a later run needs to know of it."""
+        from p2gs.export.run_folder import write_twin
+
+        obj, notes = finish(
+            learned,
+            states,
+            self.views,
+            self.cfg.phases["finish"].config,
+            self.scene.similarity,
+            seed=self.cfg.seed,
+            backend=self.cfg.rasterizer,
+        )
+        for note in notes:
+            print(note, flush=True)
+        write_twin(obj, self.run_dir, self.scene)
+        return {"parts": len(obj.parts), "notes": notes}
+
+
+def pick_device(name: str) -> torch.device:
+    """Raises UserError when CUDA is asked for and is not there."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("device: cuda was asked for, but torch sees no CUDA device; use --device cpu or auto")
+    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
+
+
+def _levels(config: Any) -> set[int]:
+    """Every image size named in a config or in the configs inside it."""
+    sizes = set(getattr(config, "levels", ()))
+    for f in dataclasses.fields(config):
+        value = getattr(config, f.name)
+        if dataclasses.is_dataclass(value):
+            sizes |= _levels(value)
+    return sizes
+
+
+def load_twin(run_dir: Path | str) -> ArticulatedObject:
+    """The twin of a result folder, in input coordinates."""
+    from p2gs.export.twin_json import load_twin as load
+
+    return load(Path(run_dir))
