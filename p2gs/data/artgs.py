@@ -46,8 +46,9 @@ def depth_path(image: Path) -> Optional[Path]:
 def _intrinsics(meta: dict, frame: dict, where: str, report: Report):
     """(K, fov) with one of them None, or None after an error."""
     both = {**meta, **frame}
-    if any(abs(float(both.get(k) or 0)) > 1e-9 for k in DISTORTION):
-        report.error(f"{where}: lens distortion ({', '.join(k for k in DISTORTION if both.get(k))}) is not supported; undistort the images first")
+    distorted = [k for k in DISTORTION if both.get(k)]
+    if distorted:
+        report.error(f"{where}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images first")
         return None
     if both.get("fl_x"):
         fx = float(both["fl_x"])

@@ -114,9 +114,8 @@ def object_box(views: Sequence[View], cells: int = 48) -> Tensor:
         for _ in range(2):  # the second pass carves the first one's box with finer cells
             box = _carve(mine, box[0], box[1], cells)
             if len(box) == 0:
-                raise UserError(
-                    f"the masks of state '{('start', 'end')[state]}' have no common object in space; cameras and masks do not belong together"
-                )
+                name = ("start", "end")[state]
+                raise UserError(f"the masks of state '{name}' show no common object in space; cameras and masks do not belong together")
         corners.append(box)
     lo = np.min([c[0] for c in corners], axis=0)
     hi = np.max([c[1] for c in corners], axis=0)

@@ -80,9 +80,8 @@ def index(root: Path, report: Report) -> list[Frame]:
         for path in missing:
             report.error(f"{path}: image is missing, but init_keyframes.yml has the frame '{key}'")
         if viewmat is not None and not missing:
-            frames.append(
-                Frame(name, int(time), "train", image, viewmat, K=K, K_source=root / "cam_K.txt", mask=mask, depth=depth if has_depth else None)
-            )
+            depth = depth if has_depth else None
+            frames.append(Frame(name, int(time), "train", image, viewmat, K=K, K_source=root / "cam_K.txt", mask=mask, depth=depth))
     known = {str(key).removeprefix("frame_") for key in keyframes}
     unposed = sorted(p.stem for p in (root / "color_segmented").glob("*.png") if p.stem not in known)
     if unposed:

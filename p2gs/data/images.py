@@ -113,13 +113,12 @@ def _read_depth(frame: Frame, shape: tuple[int, int], report: Report) -> Optiona
 
 def _check_fit(K: np.ndarray, frame: Frame, width: int, height: int, report: Report) -> bool:
     cx, cy = K[0, 2], K[1, 2]
+    point, image = f"principal point ({cx:.1f}, {cy:.1f})", f"the {width}x{height} image {frame.image.name}"
     if not (0 < cx < width and 0 < cy < height):
-        report.error(
-            f"{frame.K_source}: K does not fit the {width}x{height} image {frame.image.name}; its principal point ({cx:.1f}, {cy:.1f}) lies outside"
-        )
+        report.error(f"{frame.K_source}: K does not fit {image}, its {point} lies outside")
         return False
     if abs(cx - width / 2) > 0.2 * width or abs(cy - height / 2) > 0.2 * height:
-        report.note(f"{frame.K_source}: principal point ({cx:.1f}, {cy:.1f}) is far from the centre of the {width}x{height} image {frame.image.name}")
+        report.note(f"{frame.K_source}: {point} is far from the centre of {image}")
     return True
 
 
@@ -142,6 +141,8 @@ def read_view(frame: Frame, report: Report, downscale: float = 1.0, depth: Depth
         if z is None:
             return None
         z[alpha < 128] = 0
+        if not z.any():
+            report.note(f"{frame.depth}: holds no depth of at least {MIN_DEPTH:g} inside the mask")
     elif depth == "always":
         report.error(f"{frame.image}: has no depth, but the option depth=always asks for it")
         return None

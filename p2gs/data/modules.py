@@ -10,6 +10,7 @@ from p2gs.data.base import DATASETS, TwoStateData
 from p2gs.data.frames import Frame
 from p2gs.data.images import DepthMode
 from p2gs.data.report import Report
+from p2gs.types import UserError
 
 
 @DATASETS.register("paris")
@@ -47,3 +48,13 @@ class ArtGSData(TwoStateData):
 
     def index(self, root: Path, report: Report) -> list[Frame]:
         return artgs.index(root, report)
+
+
+def open_data(root: str, format: Optional[str] = None, **options) -> TwoStateData:
+    """The data module for a scene folder; the format is found from the folder if not given. Raises UserError where it cannot be."""
+    from p2gs.data.layouts import detect_format
+
+    format = format or detect_format(Path(root))
+    if format is None:
+        raise UserError(f"{root}: is none of the layouts {', '.join(sorted(DATASETS))}; name one as data.format")
+    return DATASETS[format](root=root, **options)

@@ -75,7 +75,9 @@ class TrainingViews:
     crop=False keeps whole images.
     """
 
-    def __init__(self, views: Sequence[View], levels: Sequence[int] = (100, 200, 400), margin: float = 0.03, align: int = 16, crop: bool = True):
+    def __init__(
+        self, views: Sequence[View], levels: Sequence[int] = (100, 200, 400), margin: float = 0.03, align: int = 16, crop: bool = True
+    ):
         self.levels = tuple(levels)
         self._stored = [self._pyramid(v, margin, align, crop) for v in views]
 
