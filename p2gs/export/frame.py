@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from torch import Tensor
-
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, Part, Similarity
 
 
@@ -53,8 +51,3 @@ def object_to_input(obj: ArticulatedObject) -> ArticulatedObject:
 def with_counts(obj: ArticulatedObject) -> list[Part]:
     """The parts, each with the number of Gaussians that carry its id."""
     return [replace(p, gaussians=int((obj.part_ids == p.id).sum())) for p in obj.parts]
-
-
-def motion_at(joint: Joint, value: Tensor | float) -> float:
-    """State time at which the joint stands at ``value`` (degrees or length from the start state)."""
-    return float(value) / joint.motion

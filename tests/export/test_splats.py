@@ -20,7 +20,13 @@ def test_splat_ply_round_trip(tmp_path, degree):
     g = torch.Generator().manual_seed(degree)
     n, b = 17, (degree + 1) ** 2
     quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=g), dim=-1)
-    a = GaussianTensors(torch.randn(n, 3, generator=g), quats, torch.randn(n, 3, generator=g), torch.randn(n, generator=g), torch.randn(n, b, 3, generator=g))
+    a = GaussianTensors(
+        torch.randn(n, 3, generator=g),
+        quats,
+        torch.randn(n, 3, generator=g),
+        torch.randn(n, generator=g),
+        torch.randn(n, b, 3, generator=g),
+    )
     ids = torch.randint(0, 4, (n,), generator=g)
     write_splat_ply(tmp_path / "a.ply", a, ids)
     back, back_ids = read_splat_ply(tmp_path / "a.ply")
@@ -132,14 +138,14 @@ def test_pose_takes_one_time_per_part():
 def test_posed_colours_do_not_change_with_the_part():
     """Seen from a camera that moves along with the door, the door looks the same."""
     from p2gs.export.pose import part_transform, pose
-    from p2gs.ops.sh import eval_sh
+    from p2gs.ops.sh import evaluate
 
     twin = toy_twin(sh_degree=3)
     door = twin.part_ids == 1
     T = part_transform(twin, 1, 1.0).float()
     dirs = torch.nn.functional.normalize(torch.randn(int(door.sum()), 3, generator=torch.Generator().manual_seed(1)), dim=-1)
-    before = eval_sh(twin.gaussians.sh[door], dirs)
-    after = eval_sh(pose(twin, 1.0).sh[door], dirs @ T[:3, :3].T)
+    before = evaluate(twin.gaussians.sh[door], dirs)
+    after = evaluate(pose(twin, 1.0).sh[door], dirs @ T[:3, :3].T)
     assert torch.allclose(before, after, atol=1e-4)
 
 

@@ -73,10 +73,15 @@ def joint_prismatic(axis, origin, length) -> Joint:
 
 def start_parts():
     """[base, door, drawer] as panels in the start state, and the two joints, in input coordinates."""
-    base = box((-0.5, -0.4, -0.5), (0.5, 0.4, 0.5), (0.75, 0.7, 0.6), skip=("-y",)) + [panel((0, -0.4, -0.5), (0, 0.8, 0), (0, 0, 1), (0.7, 0.65, 0.6))]
+    base = box((-0.5, -0.4, -0.5), (0.5, 0.4, 0.5), (0.75, 0.7, 0.6), skip=("-y",)) + [
+        panel((0, -0.4, -0.5), (0, 0.8, 0), (0, 0, 1), (0.7, 0.65, 0.6))
+    ]
     door = box((-0.49, -0.45, -0.49), (-0.01, -0.41, 0.49), (0.3, 0.45, 0.7))
     drawer = box((0.03, -0.43, -0.2), (0.47, 0.35, 0.2), (0.7, 0.35, 0.3), skip=("+z",))
-    return [base, door, drawer], [joint_revolute((0.0, 0.0, 1.0), (-0.49, -0.43, 0.0), -70.0), joint_prismatic((0.0, -1.0, 0.0), (0.25, 0.0, 0.0), 0.4)]
+    return [base, door, drawer], [
+        joint_revolute((0.0, 0.0, 1.0), (-0.49, -0.43, 0.0), -70.0),
+        joint_prismatic((0.0, -1.0, 0.0), (0.25, 0.0, 0.0), 0.4),
+    ]
 
 
 def toy_twin(similarity: Similarity = Similarity(), sh_degree=1, canonical_time=0.0) -> ArticulatedObject:
@@ -114,7 +119,9 @@ def ring(n=8, size=100, radius=2.6, elevations=(20.0, 55.0)) -> list[Camera]:
     cams = []
     for i in range(n):
         az, el = 2 * math.pi * (i + 0.25) / n, math.radians(elevations[i % len(elevations)])
-        cams.append(look_at((radius * math.cos(el) * math.cos(az), radius * math.cos(el) * math.sin(az), radius * math.sin(el)), (0, 0, 0), size))
+        cams.append(
+            look_at((radius * math.cos(el) * math.cos(az), radius * math.cos(el) * math.sin(az), radius * math.sin(el)), (0, 0, 0), size)
+        )
     return cams
 
 
@@ -125,7 +132,9 @@ def toy_scene(similarity: Similarity = Similarity(), n=8, size=100, render=None)
         for split, count, turn in (("train", n, 0.0), ("test", 2, 0.4)):
             for i, cam in enumerate(ring(count, size)):
                 viewmat = cam.viewmat.double()
-                a = torch.tensor([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]], dtype=torch.float64)
+                a = torch.tensor(
+                    [[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]], dtype=torch.float64
+                )
                 viewmat[:3, :3] = viewmat[:3, :3] @ a
                 R, t = viewmat[:3, :3], viewmat[:3, 3]
                 viewmat[:3, 3] = similarity.scale * (t + R @ torch.tensor(similarity.center, dtype=torch.float64))

@@ -1,0 +1,31 @@
+"""The result folder as the end of a fit leaves it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from p2gs.export.frame import gaussians_to_input, object_to_input
+from p2gs.export.media import scene_photos, write_media
+from p2gs.export.pose import pose
+from p2gs.export.splat_ply import write_splat_ply
+from p2gs.export.twin_json import write_twin_json
+from p2gs.export.views import scene_cameras, write_cameras
+from p2gs.types import ArticulatedObject, TwoStateScene
+
+
+def write_twin(obj: ArticulatedObject, run_dir: Path | str, scene: TwoStateScene, media: bool = True) -> None:
+    """RUN/splats/{canonical,start,end}.ply, RUN/cameras.json, RUN/media/*.png and, last, RUN/twin.json (its being there says: done).
+
+    All in input coordinates, whatever similarity ``obj`` and ``scene`` carry.
+    """
+    run_dir = Path(run_dir)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    outer = object_to_input(obj)
+    write_splat_ply(run_dir / "splats" / "canonical.ply", outer.gaussians, outer.part_ids)
+    for name, t in (("start", 0.0), ("end", 1.0)):
+        write_splat_ply(run_dir / "splats" / f"{name}.ply", gaussians_to_input(pose(outer, t), outer.similarity), outer.part_ids)
+    cameras = scene_cameras(scene)
+    write_cameras(run_dir / "cameras.json", cameras)
+    if media:
+        write_media(outer, run_dir / "media", [c.camera for c in cameras], scene_photos(scene, outer))
+    write_twin_json(obj, run_dir / "twin.json")
