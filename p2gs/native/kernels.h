@@ -8,6 +8,7 @@
 #include <cstdint>
 
 #include "adam.h"
+#include "ssim.h"
 #if __has_include("raster.h")
 #include "raster.h"
 #define P2GS_HAVE_RASTER 1
@@ -18,6 +19,7 @@ namespace p2gs {
 struct Kernels {
     const char* isa;
     AdamKernels adam;
+    SsimKernels ssim;
 #ifdef P2GS_HAVE_RASTER
     RasterKernels raster;
 #endif
