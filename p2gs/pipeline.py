@@ -21,27 +21,13 @@ from p2gs.data.views import TrainingViews
 from p2gs.models import handover
 from p2gs.models.articulation import ArticulationPhase
 from p2gs.models.canonical_fusion import CanonicalFusionPhase
-from p2gs.models.finish import FinishConfig, finish
-from p2gs.models.part_motions import PartMotionsConfig, find_part_motions
-from p2gs.models.phase import PHASES, Phase
+from p2gs.models.finish import finish
+from p2gs.models.part_motions import find_part_motions
+from p2gs.models.phase import Phase
 from p2gs.models.single_state import SingleStatePhase
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError
 
 STAGES = ("single_state", "discovery", "canonical_fusion", "articulation", "finish")
-
-
-@PHASES.register("discovery")
-class DiscoveryStage:
-    """Not trained: ``models.part_motions``."""
-
-    Config = PartMotionsConfig
-
-
-@PHASES.register("finish")
-class FinishStage:
-    """Not trained: ``models.finish``."""
-
-    Config = FinishConfig
 
 
 def run(cfg: RunConfig, only: Optional[str] = None) -> Path:
@@ -202,6 +188,8 @@ class Pipeline:
         key = self.key(stage)
         phase.save_hyperparameters({"stage": stage, "key": key})
         callbacks = section.new_callbacks()
+        for callback in callbacks.values():
+            callback.prepare(self.cfg, self.scene)
         order = sorted(callbacks, key=lambda n: (not callbacks[n].changes_result, n == "checkpoint"))
         if phase.total_steps <= 0:
             return phase.hand_over()

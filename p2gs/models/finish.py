@@ -10,6 +10,7 @@ from torch import Tensor
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.part_motions import refine
+from p2gs.models.phase import PHASES
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
@@ -31,6 +32,14 @@ class FinishConfig:
     min_motion: float = 0.01
     prismatic_below: float = 5.0
     clean_neighbours: int = 8
+
+
+@PHASES.register("finish")
+class FinishStage:
+    """A stage without training: no losses, no callbacks."""
+
+    Config = FinishConfig
+    trained = False
 
 
 def majority(labels: Tensor, neighbours: Tensor, weights: Tensor, parts: int) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.models.discovery import DiscoveryConfig, discover
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
+from p2gs.models.phase import PHASES
 from p2gs.models.screw_polish import PolishConfig, average_motion, photometric_cost, polish
 from p2gs.ops import se3, so3
 from p2gs.types import TwoStateScene
@@ -36,6 +37,14 @@ class PartMotionsConfig:
     freedom_penalty: float = 0.002
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
+
+
+@PHASES.register("discovery")
+class DiscoveryStage:
+    """A stage without training: no losses, no callbacks."""
+
+    Config = PartMotionsConfig
+    trained = False
 
 
 def find_part_motions(
