@@ -28,8 +28,9 @@ def place_repel_points(
 
     static_points [S, 3], movable_points [M, 3]: Gaussian centres in one common pose. R = min(count, how many are near); none near
     (or no movable point) gives [0, 3].
-    threshold: a fraction of ``extent`` ("relative"; by default the diagonal of all points' box), a length ("absolute"; the paper says 1.5, which takes in
-    every point of an object of the benchmarks' size), or a multiple of the static points' median nearest-neighbour distance ("spacing").
+    threshold: a fraction of ``extent`` ("relative"; by default the diagonal of all points' box), a length ("absolute"; the paper
+    says 1.5, which takes in every point of an object of the benchmarks' size), or a multiple of the static points' median
+    nearest-neighbour distance ("spacing").
     noise: standard deviation of a Gaussian offset, a length (the paper's sigma_r times the extent). No gradient.
     Raises ValueError for another mode.
     """

@@ -1,0 +1,138 @@
+"""Losses on rendered pictures, alpha, opacity and depth."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from p2gs.losses import LOSSES
+from p2gs.losses.base import LossInputs, Target
+from p2gs.types import GaussianTensors, RenderOutput
+
+F64 = torch.float64
+
+
+def make_inputs(h=14, w=17, dtype=F64, depth=True):
+    g = torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.rand(*shape, generator=g, dtype=F64).to(dtype)  # noqa: E731
+    alpha, z = draw(h, w), 1 + draw(h, w)
+    render = RenderOutput(draw(h, w, 3), alpha, alpha * z, alpha * draw(h, w) + alpha * (z - 1.5) ** 2, depth_ref=1.5)
+    known = draw(h, w) * 2 * (draw(h, w) > 0.3)
+    target = Target(draw(h, w, 3), (draw(h, w) > 0.4).to(dtype), torch.ones(3, dtype=dtype), known if depth else None, key=("view", 1))
+    logits = draw(30) * 6 - 3
+    gaussians = GaussianTensors(draw(30, 3), draw(30, 4), draw(30, 3), logits, draw(30, 1, 3))
+    return LossInputs(0, 100, gaussians, render, target)
+
+
+def pixels(inputs):
+    r, t = inputs.render, inputs.target
+    h, w = r.alpha.shape
+    return [(y, x, r, t) for y in range(h) for x in range(w)]
+
+
+def test_render_is_l1_and_structural_similarity():
+    from skimage.metrics import structural_similarity
+
+    inputs = make_inputs(40, 37)
+    a, b = inputs.render.colour, inputs.target.image
+    l1 = sum(abs(x - y) for x, y in zip(a.flatten().tolist(), b.flatten().tolist(), strict=True)) / a.numel()
+    assert LOSSES["render"](ssim_lambda=0.0)(inputs).item() == pytest.approx(l1)
+    # skimage mirrors at the border where the loss pads with zeros: give it the zeros
+    padded = [torch.nn.functional.pad(image, (0, 0, 10, 10, 10, 10)).numpy() for image in (a, b)]
+    _, similarity = structural_similarity(
+        *padded, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, full=True
+    )
+    whole = LOSSES["render"](ssim_lambda=1.0)(inputs).item()
+    assert whole == pytest.approx(1 - similarity[10:-10, 10:-10].mean(), abs=1e-6)
+    assert LOSSES["render"]()(inputs).item() == pytest.approx(0.8 * l1 + 0.2 * whole)
+    same = replace(inputs, target=replace(inputs.target, image=a))
+    assert abs(LOSSES["render"]()(same).item()) < 1e-9
+
+
+def test_render_with_and_without_a_cache_agree():
+    inputs = make_inputs(40, 37, torch.float32)
+    loss = LOSSES["render"]()
+    bare = LossInputs(0, 100, inputs.gaussians, inputs.render, replace(inputs.target, key=None))
+    for _ in range(2):
+        torch.testing.assert_close(loss(inputs), loss(bare))
+    assert len(inputs.cache) == 1
+
+
+def test_alpha_is_cross_entropy_and_its_gradient_is_bounded():
+    inputs = make_inputs()
+    value = 0.0
+    for y, x, r, t in pixels(inputs):
+        a, b = r.alpha[y, x].item(), t.alpha[y, x].item()
+        value -= b * math.log(a) + (1 - b) * math.log(1 - a)
+    assert LOSSES["alpha"](weight=1.0)(inputs).item() == pytest.approx(value / inputs.render.alpha.numel(), rel=1e-3)
+    alpha = torch.tensor([[0.0, 1.0, 0.0, 1.0]], requires_grad=True)
+    hard = replace(
+        inputs, render=replace(inputs.render, alpha=alpha), target=replace(inputs.target, alpha=torch.tensor([[0.0, 1.0, 1.0, 0.0]]))
+    )
+    LOSSES["alpha"]()(hard).backward()
+    assert torch.isfinite(alpha.grad).all()
+    assert alpha.grad.abs().max() < 1e4
+
+
+def test_opacity_pushes_away_from_one_half():
+    inputs = make_inputs()
+    value = sum(math.log(1 + math.exp(-abs(x))) for x in inputs.gaussians.opacity_logits.tolist()) / 30
+    assert LOSSES["opacity"](weight=1.0)(inputs).item() == pytest.approx(value)
+    logits = torch.tensor([-1.0, 1.0], requires_grad=True)
+    LOSSES["opacity"]()(replace(inputs, gaussians=replace(inputs.gaussians, opacity_logits=logits))).backward()
+    assert logits.grad[0] > 0 > logits.grad[1]
+    order = torch.randperm(30)
+    torch.testing.assert_close(LOSSES["opacity"]()(replace(inputs, gaussians=inputs.gaussians[order])), LOSSES["opacity"]()(inputs))
+
+
+def test_depth_is_logarithmic_over_what_is_known():
+    inputs = make_inputs()
+    terms = []
+    for y, x, r, t in pixels(inputs):
+        if t.depth[y, x] > 0 and r.alpha[y, x] > 0.1:
+            terms.append(math.log(1 + abs((r.depth[y, x] / r.alpha[y, x] - t.depth[y, x]).item())))
+    assert 0 < len(terms) < inputs.render.alpha.numel()
+    assert LOSSES["depth"](weight=1.0)(inputs).item() == pytest.approx(sum(terms) / len(terms))
+    nothing = replace(inputs, target=replace(inputs.target, depth=torch.zeros_like(inputs.target.depth)))
+    assert LOSSES["depth"]()(nothing).item() == 0
+
+
+def test_depth_variance_is_twice_its_mean_over_the_foreground():
+    inputs = make_inputs()
+    terms = []
+    for y, x, r, t in pixels(inputs):
+        if t.alpha[y, x] > 0.5:
+            A, first, second = r.alpha[y, x], r.depth[y, x] - 1.5 * r.alpha[y, x], r.depth_sq[y, x]
+            terms.append((A * second - first * first).item())
+    assert LOSSES["depth_variance"](weight=1.0, end_weight=None)(inputs).item() == pytest.approx(2 * sum(terms) / len(terms))
+    default = LOSSES["depth_variance"]()
+    assert default.weight_at(0, 100) == 30
+    assert default.weight_at(50, 100) == pytest.approx(math.sqrt(300))
+    assert default.weight_at(100, 100) == pytest.approx(10)
+    # all of the ray at one depth: none
+    r = inputs.render
+    first = r.depth - 1.5 * r.alpha
+    flat = replace(inputs, render=replace(r, depth_sq=first * first / r.alpha))
+    assert default(flat).abs().item() < 1e-9
+
+
+@pytest.mark.parametrize("name", ["render", "alpha", "depth", "depth_variance"])
+def test_gradients_against_finite_differences(name):
+    inputs, loss = make_inputs(5, 4), LOSSES[name]()
+    r = inputs.render
+    fields = ("colour", "alpha", "depth", "depth_sq")
+
+    def value(*tensors):
+        return loss(replace(inputs, render=replace(r, **dict(zip(fields, tensors, strict=True)))))
+
+    assert gradcheck(value, [getattr(r, f).clone().requires_grad_() for f in fields], eps=1e-7, atol=1e-4)
+
+
+def test_missing_inputs_give_none():
+    inputs = make_inputs(depth=False)
+    for name in ("render", "alpha", "depth", "depth_variance"):
+        assert LOSSES[name]()(LossInputs(0, 100, inputs.gaussians)) is None
+    assert LOSSES["depth"]()(inputs) is None
+    assert LOSSES["depth_variance"]()(replace(inputs, render=replace(inputs.render, depth_sq=None))) is None
