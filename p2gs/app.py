@@ -43,10 +43,11 @@ def parser(prog: str = "p2gs") -> Parser:
         return commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".", **kwargs)
 
     fit = add("fit", "take a scene from images to the finished twin", epilog=FIT_HELP)
-    fit.add_argument("-c", "--config", nargs="+", action="extend", default=[], metavar="FILE", help="YAML files, later ones laid on earlier ones")
+    several = {"nargs": "+", "action": "extend", "default": []}
+    fit.add_argument("-c", "--config", **several, metavar="FILE", help="YAML files, later ones laid on earlier ones")
     fit.add_argument("--only", metavar="PHASE", help="run this phase only (its predecessors must be there)")
     fit.add_argument("--print_config", action="store_true", help="print the merged config with all defaults and stop")
-    fit.add_argument("--plugins", nargs="+", action="extend", default=[], metavar="MODULE", help="modules with losses, callbacks, ... of your own")
+    fit.add_argument("--plugins", **several, metavar="MODULE", help="modules with losses, callbacks, ... of your own")
     fit.add_argument("--run", metavar="DIR", help="result folder (default runs/<scene>)")
     parts = fit.add_mutually_exclusive_group()
     parts.add_argument("--num_parts", metavar="N", help="number of parts including the static base, or auto (default)")
@@ -61,7 +62,8 @@ def parser(prog: str = "p2gs") -> Parser:
 
     predict = add("predict", "render a run's twin at any state between start (0) and end (1)")
     predict.add_argument("run", metavar="RUN", help="result folder of a fit")
-    predict.add_argument("--times", type=float, nargs="+", default=[0.0, 0.25, 0.5, 0.75, 1.0], metavar="T", help="states (default 0 .25 .5 .75 1)")
+    times = [0.0, 0.25, 0.5, 0.75, 1.0]
+    predict.add_argument("--times", type=float, nargs="+", default=times, metavar="T", help="states (default 0 .25 .5 .75 1)")
     predict.add_argument("--out", metavar="DIR", help="folder for the pictures (default RUN/media/states)")
     predict.add_argument("--size", type=int, metavar="PX", help="longer side of the pictures")
     predict.add_argument("--video", action="store_true", help="also a video of the motion")
@@ -85,6 +87,9 @@ def parser(prog: str = "p2gs") -> Parser:
     synth.add_argument("--kind", metavar="NAME", help="kind of object")
     synth.add_argument("--size", type=int, metavar="PX", help="image size")
     synth.add_argument("--views", type=int, metavar="N", help="training views a state")
+    synth.add_argument("--test_views", type=int, metavar="N", help="test views a state")
+    synth.add_argument("--format", choices=("artgs", "dta", "paris"), default="artgs", help="layout (default artgs)")
+    synth.add_argument("--no_depth", action="store_true", help="write no depth maps")
 
     bench = add("bench", "measure")
     what = bench.add_subparsers(dest="action", metavar="WHAT", required=True)
@@ -104,7 +109,8 @@ def run(words: list[str], prog: str = "p2gs") -> int:
             top.print_help()
             return 0
         if rest and args.command != "fit":
-            raise UsageError(f"'{rest[0]}' is no option of {prog} {args.command}{_similar(rest[0], top, args)} (see {prog} {args.command} --help)")
+            command = f"{prog} {args.command}"
+            raise UsageError(f"'{rest[0]}' is no option of {command}{_similar(rest[0], top, args)} (see {command} --help)")
         return _carry_out(args, rest)
     except UsageError as err:
         return _fail(str(err))

@@ -28,10 +28,9 @@ def lightning_main(argv: Optional[Sequence[str]] = None) -> int:
         return main(words, "lightning")
     owner = _sdk_entry_point()
     if owner is None:
-        print(
-            f"error: '{words[0]}' is no command of p2gs ({', '.join(COMMANDS)}), and {SDK}, whose command 'lightning' is otherwise, is not installed",
-            file=sys.stderr,
-        )
+        known = ", ".join(COMMANDS)
+        message = f"'{words[0]}' is no command of p2gs ({known}), and {SDK}, whose 'lightning' might know it, is not installed"
+        print(f"error: {message}", file=sys.stderr)
         return 2
     sys.argv = ["lightning", *words]
     return owner.load()() or 0

@@ -87,6 +87,8 @@ class RunConfig:
         section = self._schema.children["phases"].children[name]
         fields = Section(section.make, {k: c for k, c in section.children.items() if k not in ("losses", "callbacks")})
         config = build({k: values[k] for k in fields.children}, fields, f"phases.{name}.")
+        if "losses" not in section.children:
+            return PhaseSection(config, {}, self._schema.children["callbacks"], complete({}, self._schema.children["callbacks"]))
         losses = build(values["losses"], section.children["losses"], f"phases.{name}.losses.")
         callbacks = complete(merge(self._values["callbacks"], values["callbacks"]), self._schema.children["callbacks"])
         return PhaseSection(config, losses, self._schema.children["callbacks"], callbacks)
@@ -124,6 +126,8 @@ class RunConfig:
         if name not in self.phases:
             return plain(self._values[name])
         phase, values = self.phases[name], plain(self._values["phases"][name])
+        if "losses" not in values:
+            return values
         values["losses"] = {k: v for k, v in values["losses"].items() if v is not None}
         values["callbacks"] = {k: plain(c) for k, c in phase.callbacks.items() if c.changes_result}
         return values
@@ -163,7 +167,7 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
         formats.append(current)
     schema = run_schema(current)
     merged: Plain = {}
-    for layer, name in zip(layers, formats):
+    for layer, name in zip(layers, formats, strict=True):
         check_keys(layer.tree, schema if name in (None, current) else run_schema(name), layer.where)
         tree = layer.tree
         if isinstance(tree.get("data"), dict):  # another format later: keep what it knows too
@@ -176,7 +180,7 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
     values = complete(merged, schema)
     values.pop("p2gs")
     for name, phase in (merged.get("phases") or {}).items():
-        if phase is not None:  # a phase's callbacks say only what differs from the top
+        if phase is not None and "callbacks" in values["phases"][name]:  # a phase's callbacks say only what differs from the top
             given = complete(phase.get("callbacks") or {}, schema.children["callbacks"])
             values["phases"][name]["callbacks"] = _mentioned(given, phase.get("callbacks") or {})
     return RunConfig(values, schema)
@@ -187,7 +191,10 @@ def _mentioned(values: Plain, tree: Plain) -> Plain:
 
 
 def run_schema(data_format: Optional[str]) -> Section:
-    """All keys a config may have, given the data format and what is registered by now."""
+    """All keys a config may have, given the data format and what is registered by now.
+
+    A phase whose class says ``trained = False`` has neither losses nor callbacks.
+    """
     from p2gs.callbacks.base import CALLBACKS
     from p2gs.losses.base import LOSSES
     from p2gs.models.phase import PHASES
@@ -201,6 +208,8 @@ def run_schema(data_format: Optional[str]) -> Section:
     for name, cls in PHASES.items():
         phase = phases.children[name] = section_of(cls.Config)
         phase.optional, phase.on = True, False
+        if not getattr(cls, "trained", True):
+            continue
         for key, section in (("losses", losses), ("callbacks", callbacks)):
             if key in phase.children:
                 raise TypeError(f"{cls.__qualname__}.Config: '{key}' is a section of every phase and cannot be a field")

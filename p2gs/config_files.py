@@ -46,7 +46,7 @@ def config_folders() -> list[Path]:
 
 
 def find_config(name: str, beside: Optional[Path] = None) -> Path:
-    """The config file of that name: as given (relative to ``beside``), else among p2gs's own, with or without ``configs/`` and ``.yaml``."""
+    """The config file of that name: as given (relative to ``beside``), else among p2gs's own; ``.yaml`` may be left out."""
     given = Path(name)
     tries = [(beside / given) if beside else given]
     inner = Path(*given.parts[1:]) if given.parts and given.parts[0] == "configs" and len(given.parts) > 1 else given

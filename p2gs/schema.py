@@ -132,7 +132,7 @@ def _check_keys(tree: Plain, section: Section, prefix: str, where: str, known: l
 
 
 def nearest(path: str, known: list[str]) -> str:
-    """`` (did you mean 'x'?)``: the key that ends so, a sibling that looks alike, the same name elsewhere, a like one elsewhere; or the siblings."""
+    """`` (did you mean 'x'?)``: the key that ends so, a sibling like it, its name elsewhere, a name like it elsewhere; or the siblings."""
     parent, _, last = path.rpartition(".")
     siblings = {k.rpartition(".")[2]: k for k in known if k.rpartition(".")[0] == parent}
     names = {k.rpartition(".")[2] for k in known}

@@ -43,7 +43,7 @@ class Callback(LightningCallback):
     changes_result: ClassVar[bool] = True
 
     def prepare(self, cfg, scene) -> None:
-        """Before a phase's training. cfg: the run's RunConfig.  scene: the TwoStateScene as trained on (its ``similarity`` leads to input units)."""
+        """Before a phase's training. cfg: the run's RunConfig.  scene: the TwoStateScene as trained on (internal units)."""
 
     def on_step(self, trainer, phase) -> None:
         """After an optimiser step; ``phase.step`` counts it already."""

@@ -33,7 +33,7 @@ def fit(args: argparse.Namespace, words: list[str]) -> int:
         raise UserError("there is nothing to fit: the config names no phase (try -c preset/cpu.yaml or -c demo.yaml)")
     if args.only is not None and args.only not in cfg.phases:
         raise UserError(f"--only: the config has no phase '{args.only}'{suggest(args.only, cfg.phases)}")
-    cfg.data  # a missing data.root is told before anything is written
+    _ = cfg.data  # a missing data.root is told before anything is written
 
     from p2gs import pipeline
     from p2gs.callbacks.base import silence_lightning

@@ -71,6 +71,11 @@ def fakes(monkeypatch):
     class Second:
         Config = SecondConfig
 
+    class Untrained:
+        Config = Rates
+        trained = False
+
+    PHASES.register("untrained")(Untrained)
     PHASES.register("first")(First)
     PHASES.register("second")(Second)
 

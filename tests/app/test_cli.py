@@ -106,7 +106,7 @@ def test_an_interrupt_says_how_to_go_on(monkeypatch, capsys, raised):
             try:
                 raise KeyboardInterrupt
             except KeyboardInterrupt:
-                raise raised
+                raise raised  # noqa: B904
         raise raised
 
     monkeypatch.setattr(app, "_carry_out", work)

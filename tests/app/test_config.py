@@ -48,7 +48,8 @@ def test_overlay_merges_deeply_and_null_switches_off(base, write):
 
 
 def test_command_line_overrides_one_field_and_switches_off(base):
-    cfg = load_config([base], ["--phases.second.losses.part.weight", "0.3", "--phases.second.losses.contact", "null", "--phases.first.levels=[50]"])
+    words = ["--phases.second.losses.part.weight", "0.3", "--phases.second.losses.contact", "null", "--phases.first.levels=[50]"]
+    cfg = load_config([base], words)
     losses = cfg.phases["second"].losses
     assert losses["part"].weight == 0.3 and losses["part"].temperature == 3 and "contact" not in losses
     assert cfg.phases["first"].config.levels == [50]
@@ -69,6 +70,15 @@ def test_off_then_on_again_starts_from_defaults(base, write):
 
 def test_a_whole_phase_is_switched_off(base):
     assert list(load_config([base], ["--phases.first", "null"]).phases) == ["second"]
+
+
+def test_a_stage_that_is_not_trained_has_no_losses_and_no_callbacks(base):
+    cfg = load_config([base], ["--phases.untrained.means", "3"])
+    stage = cfg.phases["untrained"]
+    assert stage.config.means == 3 and stage.losses == {} and stage.callbacks == {}
+    assert cfg.section("untrained") == {"means": 3.0, "quats": 2e-3}
+    with pytest.raises(UserError, match="no option 'phases.untrained.losses'"):
+        load_config([base], ["--phases.untrained.losses.render", "{}"])
 
 
 def test_callbacks_of_all_phases_and_of_one(base):

@@ -268,7 +268,8 @@ def test_evaluation_finds_ground_truth_and_logs_joint_errors(tmp_path):
     log = events(tmp_path / "run")
     motion, angle = log.Scalars("tiny/error/1/motion"), log.Scalars("tiny/error/1/axis_angle")
     assert [e.step for e in motion] == [5, 10] and motion[0].value == pytest.approx(1.0, abs=1e-4)
-    assert angle[0].value == pytest.approx(0.0, abs=1e-4) and log.Scalars("tiny/error/1/axis_position")[0].value == pytest.approx(0, abs=1e-4)
+    position = log.Scalars("tiny/error/1/axis_position")
+    assert angle[0].value == pytest.approx(0.0, abs=1e-4) and position[0].value == pytest.approx(0, abs=1e-4)
     assert log.Scalars("tiny/error/failures")[0].value == 0
     assert torch.equal(before, learned.transforms)
     wrong = SimpleNamespace(data=SimpleNamespace(root=str(tmp_path / "empty")), data_options={"format": "artgs"})
