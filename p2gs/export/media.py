@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from p2gs.export.frame import object_to_input
-from p2gs.export.paint import draw, draw_joints, joint_text, part_colour, part_coloured, to_image
+from p2gs.export.paint import draw, draw_joints, joint_text, part_coloured, to_image
 from p2gs.export.pose import pose
 from p2gs.export.twin_json import load_twin
 from p2gs.export.views import best_camera, orbit, read_cameras
+from p2gs.ops.palette import part_colour
 from p2gs.types import ArticulatedObject, Camera, TwoStateScene, UserError
 
 STATES = (0.0, 0.25, 0.5, 0.75, 1.0)

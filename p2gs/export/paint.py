@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 import math
 from typing import Sequence
 
@@ -11,30 +10,10 @@ import torch
 from torch import Tensor
 
 from p2gs.export.pose import part_transform
+from p2gs.ops.palette import part_colour, part_colours
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
 from p2gs.render import rasterize
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, RenderOutput
-
-STATIC_COLOUR = (0.66, 0.68, 0.72)
-# distinct for colour-blind readers too (after Okabe and Ito), the brightest first
-MOVING_COLOURS = (
-    (0.90, 0.45, 0.05),
-    (0.10, 0.50, 0.85),
-    (0.10, 0.65, 0.45),
-    (0.85, 0.25, 0.55),
-    (0.95, 0.80, 0.15),
-    (0.50, 0.35, 0.80),
-    (0.40, 0.75, 0.95),
-)
-
-
-def part_colour(part_id: int) -> tuple[float, float, float]:
-    """RGB in 0..1: grey for the base, seven fixed colours, then hues a golden angle apart."""
-    if part_id == 0:
-        return STATIC_COLOUR
-    if part_id <= len(MOVING_COLOURS):
-        return MOVING_COLOURS[part_id - 1]
-    return colorsys.hsv_to_rgb((0.08 + 0.618034 * part_id) % 1.0, 0.7, 0.85)
 
 
 def draw(g: GaussianTensors, camera: Camera, background: float | Sequence[float] = 1.0, **options) -> RenderOutput:
@@ -55,7 +34,7 @@ def to_image(colour: Tensor) -> np.ndarray:
 def part_coloured(g: GaussianTensors, part_ids: Tensor, shading: float = 0.6) -> GaussianTensors:
     """The same Gaussians in their parts' colours, keeping some of their own lightness so that shape stays readable."""
     luma = dc_to_rgb(g.sh[:, 0]).clamp(0, 1) @ g.sh.new_tensor([0.299, 0.587, 0.114])
-    palette = g.sh.new_tensor([part_colour(i) for i in range(int(part_ids.max()) + 1 if len(part_ids) else 1)])
+    palette = part_colours(int(part_ids.max()) + 1 if len(part_ids) else 1).to(g.sh)
     colour = palette[part_ids] * (1 - shading + shading * luma.clamp_min(0.15).sqrt()[:, None] * 1.15)
     return GaussianTensors(g.means, g.quats, g.log_scales, g.opacity_logits, rgb_to_dc(colour.clamp(0, 1))[:, None])
 

@@ -1,0 +1,129 @@
+"""Scores of a finished run: joints, surfaces and pictures against what the scene has. The only command that opens ground truth.
+
+``RUN/metrics.json`` (format p2gs-metrics/1), every length in input units, missing things left out and told in ``missing``:
+
+    scene, num_parts, gaussians            name of the scene; counts of the twin
+    parts        [{id, gaussians}]
+    joints       {joints: [{gt, type, pred, pred_type, errors: {axis_angle, axis_position, motion} | null}], failures, extra, ...means}:
+                 see metrics.joints.JointReport (axis_angle degrees, axis_position x10, motion degrees or length)
+    views        {start, end, mean}: {split, count, psnr_white, psnr_black, ssim_white, ssim_black, psnr_masked, alpha_error,
+                 depth_median, depth_p90, depth_bad}: photographs that the fit did not train on where there are any; psnr_masked over
+                 the object's pixels only, alpha_error mean |alpha - mask|, depth_* of |expected depth - true| on the object,
+                 depth_bad the fraction off by more than 1 % of the object's diagonal
+    seconds      time the evaluation took
+    missing      sentences
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Optional
+
+import numpy as np
+import torch
+
+from p2gs.export.paint import draw
+from p2gs.export.pose import pose
+from p2gs.export.twin_json import load_twin
+from p2gs.export.views import bounds
+from p2gs.metrics.joints import evaluate_joints
+from p2gs.ops.ssim import psnr, ssim
+from p2gs.types import ArticulatedObject, TwoStateScene, UserError, View
+
+FORMAT = "p2gs-metrics/1"
+STATES = ("start", "end")
+
+
+def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict:
+    """Score a run, write RUN/metrics.json and return what it holds.
+
+    root: the scene's folder where it has moved since the fit. Raises UserError when the run is not finished or the scene's
+    photographs cannot be read; a scene without ground truth is scored by its photographs alone.
+    """
+    began = time.perf_counter()
+    run_dir = Path(run_dir)
+    obj = load_twin(run_dir)
+    scene, truth = open_scene(run_dir, root)
+    missing: list[str] = []
+    metrics = {"format": FORMAT, "scene": scene.name, "num_parts": len(obj.parts), "gaussians": len(obj.gaussians)}
+    metrics["parts"] = [{"id": p.id, "gaussians": int((obj.part_ids == p.id).sum())} for p in obj.parts]
+    if truth is None:
+        missing.append("the scene has no ground-truth joints or meshes")
+    else:
+        report = evaluate_joints([p.joint for p in obj.parts if p.joint is not None], truth.joints)
+        metrics["joints"] = report.to_dict()
+    metrics["views"] = view_scores(obj, scene, missing)
+    metrics["seconds"] = round(time.perf_counter() - began, 2)
+    metrics["missing"] = missing
+    path = run_dir / "metrics.json"
+    path.with_suffix(".tmp").write_text(json.dumps(metrics, indent=1) + "\n")
+    path.with_suffix(".tmp").replace(path)
+    return metrics
+
+
+def open_scene(run_dir: Path, root: Optional[Path | str] = None):
+    """The scene of a run in input coordinates, and its ground truth or None."""
+    from p2gs.config import load_config
+    from p2gs.data.ground_truth import load_ground_truth
+    from p2gs.data.layouts import LAYOUTS
+
+    path = Path(run_dir) / "config.yaml"
+    if not path.is_file():
+        raise UserError(f"{path} is missing, so the scene of this run is not known")
+    cfg = load_config([str(path)], [] if root is None else ["--data.root", str(root)])
+    scene = cfg.data.raw_scene()
+    folder, name = getattr(cfg.data, "root", None), cfg.data_options["format"]
+    truth = None if folder is None else load_ground_truth(folder, name if name in LAYOUTS else None, cfg.data_options.get("source"))
+    return scene, truth
+
+
+def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]) -> dict:
+    """Photometric and depth errors of both states and their mean. ``obj`` and ``scene`` in one coordinate system."""
+    diagonal = float((bounds(obj)[1] - bounds(obj)[0]).norm())
+    out = {}
+    for state, name in enumerate(STATES):
+        split = "test" if scene.select(state, "test") else "val" if scene.select(state, "val") else "train"
+        views = scene.select(state, split)
+        if split == "train" and views:
+            missing.append(f"the {name} state has no test views: its training views are scored")
+        if not views:
+            missing.append(f"the {name} state has no photographs")
+            continue
+        gaussians = pose(obj, float(state))
+        rows = [one_view(gaussians, view, diagonal) for view in views]
+        out[name] = {"split": split, "count": len(rows)} | _means(rows)
+    if out and not any("depth_median" in s for s in out.values()):
+        missing.append("the scene has no depth maps")
+    both = [{k: v for k, v in s.items() if k not in ("split", "count")} for s in out.values()]
+    if both:
+        out["mean"] = _means(both)
+    return out
+
+
+def one_view(gaussians, view: View, diagonal: float) -> dict[str, float]:
+    """Scores of one photograph; the render is composited over white and over black exactly as the photograph is."""
+    out = draw(gaussians, view.camera, 0.0)
+    mask = view.alpha.float() / 255
+    photo = view.image.float() / 255 * mask[..., None]
+    black = out.colour.clamp(0, 1)
+    white, photo_white = (out.colour + (1 - out.alpha)[..., None]).clamp(0, 1), photo + (1 - mask)[..., None]
+    row = {"psnr_white": float(psnr(white, photo_white)), "psnr_black": float(psnr(black, photo))}
+    row |= {"ssim_white": float(ssim(white, photo_white)), "ssim_black": float(ssim(black, photo))}
+    inside = mask > 0.5
+    if inside.any():
+        row["psnr_masked"] = float(psnr(white[inside], photo_white[inside]))
+    row["alpha_error"] = float((out.alpha - mask).abs().mean())
+    if view.depth is not None:
+        known = inside & (view.depth > 0)
+        if known.any():
+            off = (out.expected_depth - view.depth)[known].abs().numpy()
+            row["depth_median"], row["depth_p90"] = (float(np.quantile(off, q)) for q in (0.5, 0.9))
+            row["depth_bad"] = float((off > 0.01 * diagonal).mean())
+    return row
+
+
+def _means(rows: list[dict]) -> dict[str, float]:
+    keys = dict.fromkeys(k for row in rows for k in row)
+    return {k: float(np.mean([row[k] for row in rows if k in row])) for k in keys}
