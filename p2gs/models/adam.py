@@ -1,0 +1,101 @@
+"""Adam over named parameter groups, with one native call a step for all parameters in main memory."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Iterable
+
+import torch
+from torch.autograd.graph import increment_version
+
+from p2gs.native import native, num_threads
+
+
+class NamedAdam(torch.optim.Adam):
+    """``torch.optim.Adam`` (Kingma and Ba 2015, arXiv:1412.6980) whose groups have names, without weight decay and AMSGrad.
+
+    params: dicts {"params": [...], "name": str, "lr": float, ...}; names are unique.  The state is torch's (``step``, ``exp_avg``,
+    ``exp_avg_sq``), so that checkpoints and the surgery of densification see nothing unusual. float32 parameters on the CPU take the
+    native kernel, anything else torch's step. eps defaults to 3DGS's 1e-15: gradients of Gaussians are small.
+    Raises ValueError when a group has no name or a name comes twice.
+    """
+
+    def __init__(
+        self,
+        params: Iterable[dict[str, Any]],
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+    ):
+        params = list(params)
+        names = [group.get("name") for group in params]
+        if None in names or len(set(names)) != len(names):
+            raise ValueError(f"every parameter group needs a name of its own, got {names}")
+        super().__init__(params, lr=lr, betas=betas, eps=eps)
+
+    def group(self, name: str) -> dict[str, Any]:
+        """The parameter group of that name. Raises KeyError."""
+        for group in self.param_groups:
+            if group["name"] == name:
+                return group
+        raise KeyError(name)
+
+    @torch.no_grad()
+    def step(self, closure=None):
+        """One update of every parameter that has a gradient; returns what ``closure`` returns."""
+        if not self._native_applies():
+            return super().step(closure)
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        items, alive, touched = [], [], []
+        for group in self.param_groups:
+            (beta1, beta2), eps, lr = group["betas"], group["eps"], float(group["lr"])
+            for param in group["params"]:
+                if param.grad is None:
+                    continue
+                state = self.state[param]
+                if not state:
+                    state["step"] = torch.tensor(0.0)
+                    state["exp_avg"] = torch.zeros_like(param)
+                    state["exp_avg_sq"] = torch.zeros_like(param)
+                state["step"] += 1
+                t = state["step"].item()
+                grad = param.grad.contiguous()
+                alive.append(grad)
+                touched.append(param)
+                items.append(
+                    (
+                        param.data_ptr(),
+                        grad.data_ptr(),
+                        _dense(state, "exp_avg").data_ptr(),
+                        _dense(state, "exp_avg_sq").data_ptr(),
+                        param.numel(),
+                        lr / (1 - beta1**t),
+                        beta1,
+                        beta2,
+                        eps,
+                        math.sqrt(1 - beta2**t),
+                    )
+                )
+        native.adam_step(items, num_threads())
+        for param in touched:
+            increment_version(param)  # autograd shall know of the write
+        return loss
+
+    def _native_applies(self) -> bool:
+        return native is not None and all(
+            p.dtype == torch.float32
+            and p.device.type == "cpu"
+            and p.is_contiguous()
+            and (p.grad is None or (p.grad.dtype == torch.float32 and not p.grad.is_sparse))
+            for group in self.param_groups
+            for p in group["params"]
+        )
+
+
+def _dense(state: dict, key: str) -> torch.Tensor:
+    if not state[key].is_contiguous():
+        state[key] = state[key].contiguous()
+    return state[key]
