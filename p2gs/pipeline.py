@@ -165,6 +165,7 @@ class Pipeline:
             self.cfg.phases["discovery"].config,
             seed=self.cfg.seed,
             backend=self.cfg.rasterizer,
+            device=self.device,
             report=lambda *text: print("discovery:", *text, flush=True),
         )
 
@@ -238,6 +239,7 @@ class Pipeline:
             self.scene.similarity,
             seed=self.cfg.seed,
             backend=self.cfg.rasterizer,
+            device=self.device,
         )
         for note in notes:
             print(note, flush=True)

@@ -34,6 +34,10 @@ class Camera:
         """Camera centre in world coordinates, [3]."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    def to(self, device) -> "Camera":
+        """The same camera with its matrices on ``device``."""
+        return Camera(self.viewmat.to(device), self.K.to(device), self.width, self.height)
+
     def scaled(self, width: int, height: int) -> "Camera":
         """The same camera with an image of another size (pixel centres stay at +0.5)."""
         K = self.K.clone()
@@ -140,6 +144,9 @@ class GaussianTensors:
 
     def clone(self) -> "GaussianTensors":
         return GaussianTensors(*(getattr(self, n).detach().clone() for n in self.NAMES))
+
+    def to(self, device) -> "GaussianTensors":
+        return GaussianTensors(*(getattr(self, n).to(device) for n in self.NAMES))
 
     @staticmethod
     def cat(items: list["GaussianTensors"]) -> "GaussianTensors":

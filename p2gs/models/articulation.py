@@ -217,11 +217,12 @@ class ArticulationPhase(ImagePhase):
         g = self.splats.tensors().detach()
         labels = self.head(self.splats.psi).argmax(1)
         shot = self.picture(0)
-        colours = part_colours(int(labels.max()) + 1)[labels]
+        device = shot.image.device
+        colours = part_colours(int(labels.max()) + 1).to(device)[labels]
         strips = {"rgb": [], "parts": []}
         for t in times:
             posed = carry(g, labels, self.screws.at(t - self.times))
-            out = render_gaussians(posed, shot.camera, torch.ones(3), features=colours, backend=self.rasterizer)
+            out = render_gaussians(posed, shot.camera, torch.ones(3, device=device), features=colours, backend=self.rasterizer)
             painted = out.features + (1 - out.alpha[..., None])
             strips["rgb"].append(out.colour)
             strips["parts"].append(painted)

@@ -76,7 +76,7 @@ class CanonicalFusionPhase(ImagePhase):
         pictures = []
         for state in (0, 1):
             shot = self.picture(state)
-            out = render_gaussians(self.posed(state), shot.camera, torch.ones(3), backend=self.rasterizer)
+            out = render_gaussians(self.posed(state), shot.camera, torch.ones(3, device=shot.image.device), backend=self.rasterizer)
             pictures.append(torch.cat([shot.image, out.colour], dim=1))
         height = min(p.shape[0] for p in pictures)
         return {f"fusion_state_{s}": (p[:height].clamp(0, 1) * 255).to(torch.uint8) for s, p in enumerate(pictures)}

@@ -11,22 +11,23 @@ from p2gs.types import Camera, GaussianTensors, View
 
 
 @torch.no_grad()
-def render_depths(g: GaussianTensors, cameras: list[Camera], backend: str = "auto") -> tuple[list[Tensor], list[Tensor]]:
+def render_depths(g: GaussianTensors, cameras: list[Camera], backend: str = "auto", device: torch.device | str = "cpu") -> tuple[list[Tensor], list[Tensor]]:
     """Depth [H, W] (0 where the ray meets little) and alpha [H, W] of each camera.
 
     The median depth (where the ray's transmittance passes one half) does not mix a front with what shows behind its edge, as
     the mean does; where the rasterizer has none the mean is taken.
     """
     depths, alphas = [], []
+    g = g.to(device)
     for camera in cameras:
-        out = render_gaussians(g, camera, None, sh_degree=0, backend=backend)
+        out = render_gaussians(g, camera.to(device), None, sh_degree=0, backend=backend)
         depth = out.expected_depth if out.median_depth is None else out.median_depth
         depths.append(torch.where(out.alpha > 0.5, depth, torch.zeros_like(depth)).cpu())
         alphas.append(out.alpha.cpu())
     return depths, alphas
 
 
-def gather_evidence(g: GaussianTensors, views: list[View], size: int, min_opacity: float, backend: str = "auto") -> StateEvidence:
+def gather_evidence(g: GaussianTensors, views: list[View], size: int, min_opacity: float, backend: str = "auto", device="cpu") -> StateEvidence:
     """Evidence of one state: centres and colours of its solid Gaussians, depth and alpha maps of its training views.
 
     size: long edge of the maps in pixels. Gaussians below ``min_opacity`` are left out of the points.
@@ -37,7 +38,7 @@ def gather_evidence(g: GaussianTensors, views: list[View], size: int, min_opacit
     for view in views:
         factor = size / max(view.camera.width, view.camera.height)
         cameras.append(view.camera.scaled(max(round(view.camera.width * factor), 1), max(round(view.camera.height * factor), 1)))
-    depths, alphas = render_depths(g, cameras, backend)
+    depths, alphas = render_depths(g, cameras, backend, device)
     solid = torch.sigmoid(g.opacity_logits) > min_opacity
     return StateEvidence(
         points=g.means[solid].cpu(),

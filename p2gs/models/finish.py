@@ -103,7 +103,7 @@ def constrain(kind: str, T: Tensor, centre: Tensor) -> Tensor:
 
 
 def finish(
-    learned: Articulation, states: list[StateGaussians], views, config: FinishConfig, similarity: Similarity, *, seed: int, backend: str, report=None
+    learned: Articulation, states: list[StateGaussians], views, config: FinishConfig, similarity: Similarity, *, seed: int, backend: str, device="cpu"
 ) -> tuple[ArticulatedObject, list[str]]:
     """The twin, and one line for each slot that vanished."""
     labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
@@ -124,7 +124,7 @@ def finish(
     if len(types):
         found = [state_labels(learned, labels, s, transforms) for s in states]
         motions = PartMotions(types, transforms, confidence, [f[0] for f in found], [f[1] for f in found])
-        transforms = refine(states, motions, views, config.polish, seed=seed, backend=backend).transforms
+        transforms = refine(states, motions, views, config.polish, seed=seed, backend=backend, device=device).transforms
     parts = [Part(0, None, int((labels == 0).sum()))]
     for k, kind in enumerate(types):
         rows = labels == k + 1

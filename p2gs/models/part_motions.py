@@ -56,12 +56,13 @@ def find_part_motions(
     *,
     seed: int,
     backend: str = "auto",
+    device: torch.device | str = "cpu",
     report=None,
 ) -> PartMotions:
     """Parts, motions and labels of every Gaussian of both states, from the reconstructions and the images alone."""
     say = report or (lambda text: None)
     say("rendering depth of both states")
-    evidence = [gather_evidence(s.gaussians, scene.select(state=s.state, split="train"), config.evidence_size, config.min_opacity, backend) for s in states]
+    evidence = [gather_evidence(s.gaussians, scene.select(state=s.state, split="train"), config.evidence_size, config.min_opacity, backend, device) for s in states]
     say("looking for parts")
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
     explanations = _explanations(found)[: max(config.candidates, 1)]
@@ -70,13 +71,13 @@ def find_part_motions(
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
             say(f"re-rendering explanation {number + 1} of {len(explanations)}")
-        motions = refine(states, motions, views, config.coarse, seed=seed, backend=backend)
-        cost = explanation_cost(states, motions, views, level, backend)
+        motions = refine(states, motions, views, config.coarse, seed=seed, backend=backend, device=device)
+        cost = explanation_cost(states, motions, views, level, backend, device)
         costs.append(cost)
         if best is None or cost < best[0]:
             best = (cost, motions, number)
     motions = best[1]
-    motions = settle_types(states, motions, views, config, seed=seed, backend=backend)
+    motions = settle_types(states, motions, views, config, seed=seed, backend=backend, device=device)
     motions.diagnostics = {"explanation": best[2], "photometric_costs": costs, **_plain(found.diagnostics)}
     return motions
 
@@ -106,31 +107,31 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
     return torch.where(motions.margin[state] >= min_margin, motions.labels[state], -1)
 
 
-def refine(states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, types=None, both: bool = True) -> PartMotions:
+def refine(states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu", types=None, both: bool = True) -> PartMotions:
     """Photometric refinement of all motions: start Gaussians into the end images, then end Gaussians into the start images; the mean of both."""
     if config.steps <= 0 or len(motions) == 0:
         return motions
     types = types or motions.types
     forward, _ = polish(
-        states[0].gaussians, polish_labels(motions, 0, config.min_margin), motions.transforms, types, views[1], config, seed=seed, backend=backend
+        states[0].gaussians, polish_labels(motions, 0, config.min_margin), motions.transforms, types, views[1], config, seed=seed, backend=backend, device=device
     )
     result = forward
     if both:
         backward, _ = polish(
-            states[1].gaussians, polish_labels(motions, 1, config.min_margin), se3.inverse(forward), types, views[0], config, seed=seed + 1, backend=backend
+            states[1].gaussians, polish_labels(motions, 1, config.min_margin), se3.inverse(forward), types, views[0], config, seed=seed + 1, backend=backend, device=device
         )
         result = torch.stack([average_motion(a, se3.inverse(b)) for a, b in zip(forward, backward)])
     return PartMotions(motions.types, result, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
 
 
-def explanation_cost(states, motions: PartMotions, views, level: int, backend: str) -> float:
+def explanation_cost(states, motions: PartMotions, views, level: int, backend: str, device="cpu") -> float:
     """Image loss of each state's Gaussians moved into the other state's photographs, both directions averaged."""
-    there = photometric_cost(states[0].gaussians, motions.labels[0], motions.transforms, views[1], level=level, backend=backend)
-    back = photometric_cost(states[1].gaussians, motions.labels[1], se3.inverse(motions.transforms), views[0], level=level, backend=backend)
+    there = photometric_cost(states[0].gaussians, motions.labels[0], motions.transforms, views[1], level=level, backend=backend, device=device)
+    back = photometric_cost(states[1].gaussians, motions.labels[1], se3.inverse(motions.transforms), views[0], level=level, backend=backend, device=device)
     return 0.5 * (there + back)
 
 
-def settle_types(states, motions: PartMotions, views, config: PartMotionsConfig, *, seed: int, backend: str) -> PartMotions:
+def settle_types(states, motions: PartMotions, views, config: PartMotionsConfig, *, seed: int, backend: str, device="cpu") -> PartMotions:
     """Fit both joint types where the angle leaves room for doubt, keep the one the images prefer; then refine with the types held."""
     level = config.coarse.levels[-1]
     for k in range(len(motions)):
@@ -144,8 +145,8 @@ def settle_types(states, motions: PartMotions, views, config: PartMotionsConfig,
         slide[k, :3, 3] = motions.transforms[k, :3, :3] @ centre + motions.transforms[k, :3, 3] - centre
         types = [*motions.types[:k], "prismatic", *motions.types[k + 1 :]]
         other = PartMotions(types, slide, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
-        other = refine(states, other, views, config.coarse, seed=seed, backend=backend)
-        if explanation_cost(states, other, views, level, backend) <= explanation_cost(states, motions, views, level, backend) * (1 + config.freedom_penalty):
+        other = refine(states, other, views, config.coarse, seed=seed, backend=backend, device=device)
+        if explanation_cost(states, other, views, level, backend, device) <= explanation_cost(states, motions, views, level, backend, device) * (1 + config.freedom_penalty):
             motions = other
     return motions
 

@@ -48,10 +48,11 @@ class MovedGaussians:
     labels [N] int64: 0 static, k moved by transforms[k-1], -1 left out.
     """
 
-    def __init__(self, gaussians: GaussianTensors, labels: Tensor):
+    def __init__(self, gaussians: GaussianTensors, labels: Tensor, device: torch.device | str = "cpu"):
         keep = labels >= 0
-        self.g = gaussians.detach()[keep]
-        self.labels = labels[keep]
+        self.g = gaussians.detach()[keep].to(device)
+        self.labels = labels[keep].to(device)
+        self.device = self.labels.device
         self.scales = self.g.log_scales.exp()
         self.opacities = torch.sigmoid(self.g.opacity_logits)
         self.quats = so3.quat_normalize(self.g.quats)
@@ -62,20 +63,22 @@ class MovedGaussians:
 
     def moved(self, transforms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Means [N, 3], quats [N, 4] and SH [N, B, 3] after the motions; transforms [K-1, 4, 4]."""
-        T = torch.cat([torch.eye(4)[None], transforms.float()])[self.labels]
+        transforms = transforms.float().to(self.device)
+        T = torch.cat([torch.eye(4, device=self.device)[None], transforms])[self.labels]
         R = T[:, :3, :3]
         means = torch.einsum("nij,nj->ni", R, self.g.means) + T[:, :3, 3]
-        turn = so3.matrix_to_quat(torch.cat([torch.eye(3)[None], transforms[:, :3, :3].float()]))[self.labels]
+        turn = so3.matrix_to_quat(torch.cat([torch.eye(3, device=self.device)[None], transforms[:, :3, :3]]))[self.labels]
         quats = so3.quat_multiply(turn, self.quats)
         sh = self.g.sh
         if sh.shape[1] > 1:
             sh = sh.clone()
             for k in range(len(transforms)):
                 rows = self.rows(k + 1)
-                sh[rows] = rotate_sh(sh[rows], transforms[k, :3, :3].float())
+                sh[rows] = rotate_sh(sh[rows], transforms[k, :3, :3])
         return means, quats, sh
 
     def render(self, means: Tensor, quats: Tensor, sh: Tensor, camera: Camera, background: Tensor, backend: str):
+        camera, background = camera.to(self.device), background.to(self.device)
         return rasterize(
             means, quats, self.scales, self.opacities, sh, camera.viewmat, camera.K, camera.width, camera.height, background=background, backend=backend
         )
@@ -136,7 +139,7 @@ def polish(
     *,
     seed: int,
     backend: str = "auto",
-    report=None,
+    device: torch.device | str = "cpu",
 ) -> tuple[Tensor, dict]:
     """Refine ``transforms`` [K-1, 4, 4] (this state -> the views' state) so that the moved Gaussians match the views.
 
@@ -147,7 +150,7 @@ def polish(
     if config.steps <= 0 or len(transforms) == 0:
         return transforms, {"loss": float("nan"), "curvature": torch.zeros(len(transforms), 6)}
     solid = torch.sigmoid(gaussians.opacity_logits) > config.min_opacity
-    body = MovedGaussians(gaussians, torch.where(solid, labels, -1))
+    body = MovedGaussians(gaussians, torch.where(solid, labels, -1), device)
     rows = [body.rows(k + 1) for k in range(len(transforms))]
     radius, first, second = [], torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
     for r in rows:
@@ -163,7 +166,7 @@ def polish(
         means.requires_grad_(True)
         quats.requires_grad_(True)
         out = body.render(means, quats, sh, shot.camera, background, backend)
-        loss = l1_ssim(out.colour, shot.image, config.ssim_lambda)
+        loss = l1_ssim(out.colour, shot.image.to(out.colour.device), config.ssim_lambda)
         loss.backward()
         rate = config.rate * exponential(1.0, 0.01, fraction)
         if fraction >= 0.9:
@@ -173,7 +176,7 @@ def polish(
                 continue
             centre = means.detach()[r].double().mean(0)
             rotation, translation = tangent_gradient(means.detach()[r], quats.detach()[r], means.grad[r], quats.grad[r], centre)
-            gradient = torch.cat([rotation / radius[k], translation])
+            gradient, centre = torch.cat([rotation / radius[k], translation]).cpu(), centre.cpu()
             first[k] = 0.9 * first[k] + 0.1 * gradient
             second[k] = 0.99 * second[k] + 0.01 * gradient * gradient
             direction = first[k] / (1 - 0.9 ** (step + 1)) / ((second[k] / (1 - 0.99 ** (step + 1))).sqrt() + 1e-12)
@@ -181,8 +184,9 @@ def polish(
             transforms[k] = apply_step(transforms[k], centre, radius[k], delta)
             if types[k] == "prismatic":
                 transforms[k, :3, :3] = torch.eye(3, dtype=torch.float64)
-        if report is not None:
-            report(step + 1, config.steps)
+    for k, kind in enumerate(types):
+        if kind == "revolute":
+            transforms[k] = se3.project_revolute(transforms[k])  # what pitch the last steps left
     return transforms, {"loss": sum(losses) / max(len(losses), 1), "curvature": second}
 
 
@@ -197,16 +201,17 @@ def photometric_cost(
     count: int = 16,
     ssim_lambda: float = 0.8,
     backend: str = "auto",
+    device: torch.device | str = "cpu",
 ) -> float:
     """Mean image loss of the moved Gaussians over ``count`` views spread over the training set: lower explains the images better."""
-    body = MovedGaussians(gaussians, labels)
-    means, quats, sh = body.moved(transforms.double())
+    body = MovedGaussians(gaussians, labels, device)
+    means, quats, sh = body.moved(transforms)
     total, picked = 0.0, torch.linspace(0, len(views) - 1, min(count, len(views))).round().long().tolist()
     for index in picked:
         background = torch.full((3,), 0.5)
         shot = views.get(index, views.levels.index(level), background)
         out = body.render(means, quats, sh, shot.camera, background, backend)
-        total += float(l1_ssim(out.colour, shot.image, ssim_lambda))
+        total += float(l1_ssim(out.colour, shot.image.to(out.colour.device), ssim_lambda))
     return total / len(picked)
 
 

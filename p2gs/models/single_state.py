@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 
 import torch
@@ -97,12 +98,16 @@ class ImagePhase(Phase):
         picked = views.get(view_index(self.seed + 7919 * state, step, len(views)), views.levels.index(self.level(step)), background)
         # the same view recurs with other backgrounds: statistics of the target may be cached only where it does not change
         key = picked.key if self.config.background != "random" else None
-        return picked.camera, Target(picked.image, picked.alpha, background, picked.depth, key)
+        device = self.splats.means.device
+        depth = None if picked.depth is None else picked.depth.to(device)
+        return picked.camera.to(device), Target(picked.image.to(device), picked.alpha.to(device), background.to(device), depth, key)
 
     def picture(self, state: int):
         """The first training view of a state on white, at the finest level: what previews show."""
         views = self.views[state]
-        return views.get(0, views.levels.index(self.config.levels[-1]), torch.ones(3))
+        shot = views.get(0, views.levels.index(self.config.levels[-1]), torch.ones(3))
+        device = self.splats.means.device
+        return dataclasses.replace(shot, image=shot.image.to(device), camera=shot.camera.to(device))
 
     def render(self, g: GaussianTensors, camera: Camera, background: Tensor, sh_degree: int | None = None) -> RenderOutput:
         return render_gaussians(
@@ -170,7 +175,8 @@ class SingleStatePhase(ImagePhase):
     @torch.no_grad()
     def preview(self, times: list[float]) -> dict[str, Tensor]:
         shot = self.picture(self.state)
-        out = render_gaussians(self.splats.tensors(), shot.camera, torch.ones(3), backend=self.rasterizer)
+        white = torch.ones(3, device=shot.image.device)
+        out = render_gaussians(self.splats.tensors(), shot.camera, white, backend=self.rasterizer)
         both = torch.cat([shot.image, out.colour], dim=1)
         return {f"state_{self.state}": (both.clamp(0, 1) * 255).to(torch.uint8)}
 

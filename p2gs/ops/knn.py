@@ -40,8 +40,8 @@ def _tree(points: Tensor, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
     from scipy.spatial import cKDTree
 
     # Sliding midpoint instead of medians: half the time to build, and as fast to ask for points on surfaces.
-    tree = cKDTree(points.double().numpy(), balanced_tree=False, compact_nodes=False)
-    distance, index = tree.query(queries.double().numpy(), k=range(1, k + 1), workers=num_threads())
+    tree = cKDTree(points.detach().double().numpy(), balanced_tree=False, compact_nodes=False)
+    distance, index = tree.query(queries.detach().double().numpy(), k=range(1, k + 1), workers=num_threads())
     return torch.from_numpy(distance).to(points.dtype), torch.from_numpy(index).long()
 
 

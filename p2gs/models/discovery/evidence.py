@@ -1,0 +1,104 @@
+"""What two reconstructed states say about space: seen through, surface, or hidden behind something.
+
+A point of one state that the other state's cameras look *through* has moved. A point with something in *front* of it is unknown,
+not moved: a cupboard's inside that appears when its door opens must not become a part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Optional, Sequence
+
+import torch
+from torch import Tensor
+
+from p2gs.types import Camera
+
+
+@dataclass
+class StateEvidence:
+    """One reconstructed state: a point cloud (the splat's centres) and rendered depth of its training views.
+
+    points [N, 3]; colours [N, 3] in 0..1; normals [N, 3] or None; weights [N], e.g. opacity.
+    depths: V maps [H, W] float32, z along the camera, 0 where nothing; alphas: V maps [H, W]; cameras: V cameras of that size.
+    """
+
+    points: Tensor
+    colours: Tensor
+    normals: Optional[Tensor]
+    weights: Tensor
+    depths: Sequence[Tensor]
+    alphas: Sequence[Tensor]
+    cameras: Sequence[Camera]
+
+
+class DepthStack:
+    """The depth maps of one state as intervals: near/far [V, H, W] are 3x3 minimum and maximum; background is infinitely far.
+
+    The interval makes a depth edge count as surface, never as free space. Raises ValueError when views differ in size.
+    """
+
+    def __init__(self, depths: Sequence[Tensor], alphas: Sequence[Tensor], cameras: Sequence[Camera]):
+        sizes = {(c.height, c.width) for c in cameras} | {tuple(d.shape) for d in depths} | {tuple(a.shape) for a in alphas}
+        if len(sizes) != 1 or not len(depths) == len(alphas) == len(cameras):
+            raise ValueError(f"every view needs a camera, a depth and an alpha map of one size, got sizes {sorted(sizes)}")
+        self.depth = torch.stack([d.float() for d in depths])
+        self.valid = (torch.stack([a.float() for a in alphas]) > 0.5) & (self.depth > 0)
+        self.cameras = list(cameras)
+        self.viewmat = torch.stack([c.viewmat for c in cameras]).float()
+        self.K = torch.stack([c.K for c in cameras]).float()
+        self.position = torch.stack([c.position for c in cameras]).float()
+        z = torch.where(self.valid, self.depth, torch.full_like(self.depth, torch.inf))[:, None]
+        self.far = torch.nn.functional.max_pool2d(z, 3, 1, 1)[:, 0]
+        self.near = -torch.nn.functional.max_pool2d(-z, 3, 1, 1)[:, 0]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def spread(self, n: int) -> Tensor:
+        """Indices of at most ``n`` views, spread over the directions (farthest point order from view 0)."""
+        if n >= len(self):
+            return torch.arange(len(self))
+        chosen = [0]
+        d = (self.position - self.position[0]).norm(dim=1)
+        while len(chosen) < n:
+            chosen.append(int(d.argmax()))
+            d = torch.minimum(d, (self.position - self.position[chosen[-1]]).norm(dim=1))
+        return torch.tensor(sorted(chosen))
+
+    def project(self, points: Tensor, views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """points [N, 3] -> z [N, V], flat pixel index [N, V] (clamped) and whether it is inside the image [N, V]."""
+        R, t, K = self.viewmat[views, :3, :3], self.viewmat[views, :3, 3], self.K[views]
+        cam = torch.einsum("vij,nj->nvi", R, points) + t
+        z = cam[..., 2]
+        u = cam[..., 0] / z.clamp_min(1e-6) * K[:, 0, 0] + K[:, 0, 2]
+        v = cam[..., 1] / z.clamp_min(1e-6) * K[:, 1, 1] + K[:, 1, 2]
+        H, W = self.depth.shape[1:]
+        inside = (z > 1e-6) & (u >= 0) & (u < W) & (v >= 0) & (v < H)
+        index = v.clamp(0, H - 1).long() * W + u.clamp(0, W - 1).long()
+        return z, index + views * (H * W), inside
+
+    def counts(self, points: Tensor, tau: float, views: Optional[Tensor] = None, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, Tensor]:
+        """How many views call each point free (they see past it), on a surface, behind one.  [N] float each.
+
+        tau: tolerance along the ray, scene units. Views that do not contain the point say nothing.
+        """
+        views = torch.arange(len(self)) if views is None else views
+        out = points.new_zeros(3, len(points))
+        step = max(1, chunk // len(views))
+        near, far = self.near.reshape(-1), self.far.reshape(-1)
+        for i in range(0, len(points), step):
+            z, index, inside = self.project(points[i : i + step], views)
+            free = inside & (z < near[index] - tau)
+            behind = inside & (z > far[index] + tau)
+            out[0, i : i + step] = free.sum(1)
+            out[1, i : i + step] = (inside & ~free & ~behind).sum(1)
+            out[2, i : i + step] = behind.sum(1)
+        return out[0], out[1], out[2]
+
+
+def classify(free: Tensor, on: Tensor, need: float = 3.0, ratio: float = 1.5) -> tuple[Tensor, Tensor]:
+    """Votes -> (moved, static): moved when at least ``need`` views see through and ``ratio`` times more than see a surface."""
+    moved = (free >= need) & (free > ratio * on)
+    static = (on >= 2) & (on > ratio * free)
+    return moved, static

@@ -1,0 +1,104 @@
+"""Sharpen motion hypotheses: batched constrained point-to-plane steps, then a derivative-free search on the evidence itself.
+
+Point-to-plane is blind to sliding within a door's plane; free space is not, so the second step uses the full landing cost.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from p2gs.models.discovery.hypotheses import balanced
+from p2gs.models.discovery.problem import Problem, paid
+from p2gs.models.discovery.rigid import Motions
+
+
+def normal_equations(problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], width: float):
+    """J^T W J [B, 5, 5] and J^T W r [B, 5] of both states' point-to-plane residuals, Geman-McClure weights of ``width``."""
+    B = motions.twist_basis()
+    A = torch.zeros(len(motions), 5, 5)
+    b = torch.zeros(len(motions), 5)
+    for s in (0, 1):
+        surf, target, landing = problem.surfels[s], problem.surfels[1 - s], problem.landings[1 - s]
+        p, n = surf.points[samples[s]], surf.normals[samples[s]]
+        x = motions.apply(p, inverse=s == 1)
+        nx = motions.rotate(n, inverse=s == 1)
+        j = landing.match(x, nx)
+        q, m = target.points[j], target.normals[j]
+        r = ((x - q) * m).sum(2)
+        off = (x - q).pow(2).sum(2) - r * r
+        w = weights[s] / (1 + (r / width) ** 2) ** 2
+        w = w * (off < (landing.hc + 2 * problem.scale.spacing) ** 2) * ((nx * m).sum(2) > 0.5) * (1 - 0.7 * landing.static[j].float())
+        if s == 0:
+            J = torch.cat([torch.linalg.cross(x, m), m], 2)
+        else:  # the residual seen in the end state: plane carried along, point p at rest
+            Rm = motions.rotate(m)
+            J = -torch.cat([torch.linalg.cross(p.expand_as(x), Rm), Rm], 2)
+        J = J @ B
+        A += torch.einsum("bp,bpi,bpj->bij", w, J, J)
+        b += torch.einsum("bp,bpi,bp->bi", w, J, r)
+    return A, b
+
+
+def gauss_newton(problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], rounds: int = 8) -> Motions:
+    """A few damped steps with a kernel shrinking from two coarse voxels to the surface tolerance."""
+    hc, tp = problem.landings[0].hc, problem.scale.tp
+    unit = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0])
+    for k in range(rounds):
+        width = 1.5 * hc * (tp / (1.5 * hc)) ** (k / max(1, rounds - 1))
+        A, b = normal_equations(problem, motions, samples, weights, width)
+        trace = A.diagonal(dim1=1, dim2=2).sum(1).clamp_min(1e-12)
+        A = A + torch.diag_embed(0.02 * trace[:, None] * unit)
+        step = -torch.linalg.solve(A, b[..., None])[..., 0]
+        limit = torch.cat([torch.full((1,), 2 * hc), torch.full((2,), 0.08), torch.full((2,), 2 * hc)])
+        motions = motions.displaced(torch.maximum(torch.minimum(step, limit), -limit))
+    return motions
+
+
+class Gain:
+    """Evidence for one more motion given what each point costs already: [B] from motions [B]."""
+
+    def __init__(self, problem: Problem, samples: list[Tensor], weights: list[Tensor], paid_already: list[Tensor] | None = None):
+        self.problem, self.samples, self.weights, self.already = problem, samples, weights, paid_already
+
+    def pay(self, motions: Motions) -> list[Tensor]:
+        return self.problem.pay(motions, self.samples)
+
+    def __call__(self, motions: Motions) -> Tensor:
+        total = []
+        for s, p in enumerate(self.pay(motions)):
+            if self.already is not None:
+                p = (p - self.already[s]).clamp_min(0)
+            total.append(p @ self.weights[s])
+        return balanced(total[0], total[1])
+
+
+def pattern_search(gain, motions: Motions, length: float, rounds: int = 10, turn_radius: float = 0.4, value: Tensor | None = None) -> tuple[Motions, Tensor]:
+    """Coordinate steps (both signs, 5 coordinates), step halved where nothing improves. Returns motions and their gains.
+
+    length: first step in scene units; angles step by length / turn_radius. gain: Motions [B] -> [B].
+    """
+    B = len(motions)
+    value = gain(motions) if value is None else value
+    scale = torch.ones(B) * length
+    r = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0])
+    turn = torch.tensor([1 / turn_radius, 1 / turn_radius, 1 / turn_radius, 1.0, 1.0])
+    moves = torch.cat([torch.eye(5), -torch.eye(5)])
+    for _ in range(rounds):
+        unit = torch.where(motions.turn[:, None], turn, r)
+        step = (moves[None] * unit[:, None] * scale[:, None, None]).reshape(-1, 5)
+        many = motions[torch.arange(B).repeat_interleave(len(moves))]
+        tried = many.displaced(step)
+        v = gain(tried).reshape(B, len(moves))
+        best, k = v.max(1)
+        better = best > value + 1e-7
+        pick = tried[torch.arange(B) * len(moves) + k]
+        motions = Motions(
+            motions.turn,
+            torch.where(better[:, None], pick.axis, motions.axis),
+            torch.where(better[:, None], pick.centre, motions.centre),
+            torch.where(better, pick.amount, motions.amount),
+        )
+        value = torch.where(better, best, value)
+        scale = torch.where(better, scale, scale * 0.5)
+    return motions, value
