@@ -10,7 +10,7 @@ A new source is a subclass with one method, ``read()``, registered by name::
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Iterator, Literal, Optional
+from typing import Iterator, Literal, Optional, Sequence, TypeVar
 
 import numpy as np
 from lightning.pytorch import LightningDataModule
@@ -21,8 +21,9 @@ from p2gs.data.images import DepthMode, read_views
 from p2gs.data.report import Report, StrictReport
 from p2gs.data.views import view_index
 from p2gs.registry import Registry
-from p2gs.types import TwoStateScene, UserError
+from p2gs.types import TwoStateScene, UserError, View
 
+Shot = TypeVar("Shot", Frame, View)
 DATASETS: Registry[type["TwoStateData"]] = Registry("data format")
 
 
@@ -123,13 +124,18 @@ def with_box(scene: TwoStateScene) -> TwoStateScene:
     return TwoStateScene(scene.name, scene.views, scene.similarity, object_box(scene.select(split="train")))
 
 
-def thin_out(frames: list[Frame], max_views: Optional[int]) -> list[Frame]:
-    """At most ``max_views`` training frames a state, spread over the cameras' positions; other splits stay whole."""
+def thin_out(frames: Sequence[Shot], max_views: Optional[int]) -> list[Shot]:
+    """At most ``max_views`` training frames (or views) a state, spread over the cameras' positions; other splits stay whole."""
     if max_views is None:
-        return frames
-    keep = [f for f in frames if f.split != "train"]
+        return list(frames)
+    keep: set[int] = {i for i, f in enumerate(frames) if f.split != "train"}
     for state in (0, 1):
-        mine = [f for f in frames if f.split == "train" and f.state == state]
+        mine = [i for i, f in enumerate(frames) if f.split == "train" and f.state == state]
         if mine:
-            keep += [mine[i] for i in farthest_cameras(np.stack([f.position for f in mine]), max_views)]
-    return sorted(keep, key=lambda f: (f.state, f.split != "train", f.split))
+            positions = np.stack([_position(frames[i]) for i in mine])
+            keep |= {mine[j] for j in farthest_cameras(positions, max_views)}
+    return [f for i, f in enumerate(frames) if i in keep]
+
+
+def _position(shot: Shot) -> np.ndarray:
+    return shot.position if isinstance(shot, Frame) else shot.camera.position.numpy()
