@@ -1,0 +1,1 @@
+"""Scores against ground truth: ``joints``, ``chamfer``, ``image``, ``penetration`` (functions), ``modules`` (torchmetrics classes)."""

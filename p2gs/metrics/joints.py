@@ -76,6 +76,11 @@ class JointReport:
     motion_mean_revolute: float | None = None
     motion_mean_prismatic: float | None = None
 
+    @property
+    def assignment(self) -> dict[int, int]:
+        """gt index -> pred index of what was matched, rightly typed or not (for ``evaluate_chamfer``)."""
+        return {s.gt: s.pred for s in self.joints if s.pred is not None}
+
     def to_dict(self) -> dict:
         """Plain numbers, for JSON."""
         return asdict(self)
