@@ -1,9 +1,52 @@
+# make setup | demo | test | sanitize | clean.  PYTHON chooses the interpreter that .venv is made of.
 PYTHON ?= python3
 BIN := .venv/bin
+NATIVE := $(wildcard p2gs/native/*.cpp p2gs/native/*.h p2gs/native/*.inc)
+PLATLIB = $(shell $(BIN)/python -c "import sysconfig; print(sysconfig.get_path('platlib'))")
+# Idle threads of torch spin by default, on cores that the kernels want.
+export OMP_WAIT_POLICY ?= passive
 
-native:  ## rebuild the C++ extension of an editable install after an edit (seconds)
-	cmake --build build/editable
-	@rm -f $$($(BIN)/python -c "import sysconfig; print(sysconfig.get_path('platlib'))")/p2gs/_native*  # others may have it mapped
-	@cmake --install build/editable --prefix $$($(BIN)/python -c "import sysconfig; print(sysconfig.get_path('platlib'))") >/dev/null
+.PHONY: setup setup-dev native demo test sanitize clean
 
-.PHONY: native
+setup: .venv/.built
+
+setup-dev: .venv/.dev .venv/.built
+
+# torch first and pinned: everything else must fit it, not the other way round
+.venv/.deps: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/pip install -q -c constraints.txt torch
+	$(BIN)/pip install -q -c constraints.txt -e .
+	touch $@ .venv/.built
+
+.venv/.dev: .venv/.deps
+	$(BIN)/pip install -q -c constraints.txt -e ".[dev]"
+	touch $@ .venv/.built
+
+.venv/.built: .venv/.deps CMakeLists.txt $(NATIVE)
+	$(BIN)/pip install -q --no-deps -e .
+	touch $@
+
+# The extension alone, in seconds, for work on the C++ (after setup-dev).
+native:
+	test -e build/native/CMakeCache.txt || cmake -S . -B build/native -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python >/dev/null
+	cmake --build build/native -j 2
+	@rm -f $(PLATLIB)/p2gs/_native*  # a running program may have the old one mapped: replace it, never write into it
+	@cmake --install build/native --prefix $(PLATLIB) >/dev/null
+
+demo: setup
+	$(BIN)/p2gs fit -c configs/demo.yaml
+	$(BIN)/p2gs test runs/demo
+
+test: setup-dev
+	$(BIN)/python -m pytest --timeout=300
+
+# The tests of the kernels with address and undefined-behaviour sanitizers.
+sanitize: setup-dev
+	cmake -S . -B build/sanitize -DP2GS_SANITIZE=ON -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python >/dev/null
+	cmake --build build/sanitize -j 2
+	LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
+	P2GS_NATIVE_FILE=$$(ls $(CURDIR)/build/sanitize/_native*) $(BIN)/python -m pytest --timeout=600 tests/native
+
+clean:
+	rm -rf .venv build dist wheelhouse runs .pytest_cache .ruff_cache .hypothesis

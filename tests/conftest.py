@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import random
+import sys
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads would take the cores from the kernels
@@ -11,6 +13,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning th
 import numpy as np
 import pytest
 import torch
+
+import p2gs
+
+if "P2GS_NATIVE_FILE" in os.environ:  # another build of the kernels, as `make sanitize` wants it
+    _spec = importlib.util.spec_from_file_location("p2gs._native", os.environ["P2GS_NATIVE_FILE"])
+    p2gs._native = sys.modules["p2gs._native"] = importlib.util.module_from_spec(_spec)
+    _spec.loader.exec_module(p2gs._native)
 
 
 @pytest.fixture(scope="session")
