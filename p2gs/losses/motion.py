@@ -93,7 +93,7 @@ class Art(Loss):
     anneal: float = 0.75
     sign: Literal["paper", "away"] = "paper"
     min_prob: float = 1e-2
-    sample: int = 4096
+    sample: int = 2048
     robust: float | None = None
 
     def compute(self, inputs: LossInputs) -> Tensor | None:

@@ -11,6 +11,7 @@ from p2gs.losses.base import Loss, LossInputs, register_loss
 from p2gs.losses.motion import select_pairs
 from p2gs.losses.parts import sample_rows
 from p2gs.ops import se3
+from p2gs.ops.knn import knn
 
 
 @register_loss("velocity")
@@ -64,8 +65,6 @@ class Contact(Loss):
     sample: int = 1024
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
-        from p2gs.ops.knn import knn
-
         parts = inputs.parts
         if parts is None or len(parts.transforms) < 2:
             return None
