@@ -19,9 +19,9 @@ class Velocity(Loss):
     """A part's points move alike: sum_k Var over i in part k of a displacement (paper section 4.4, L_velocity).
 
     variant: "rigid" takes the displacement that the part's rigid motion leaves unexplained, R_k mu0 + t_k - mu1: zero for every
-    true rigid motion. "paper" takes mu1 - mu0 itself, which is zero for translations only and, weighed against ``vector``,
-    pulls a 60 degree door to about 49 degrees. Var is the membership-weighted mean of squared distances from the weighted mean,
-    over the observed pairs; a slot of less than one Gaussian's mass counts less.
+    true rigid motion. "paper" takes mu1 - mu0 itself, which is zero for translations only: it charges for turning, teaches the
+    labels alone (the screws do not occur in it) and would rather split a door. Var is the membership-weighted mean of squared
+    distances from the weighted mean, over the observed pairs; a slot of less than one Gaussian's mass counts less.
     reduce: mean over the slots, or the paper's sum.  sample: pairs looked at per step (0: all).
     """
 

@@ -111,3 +111,27 @@ def test_missing_parts_fail_and_are_counted():
     one_state = {"start": C.PartMeshes(base, [door]), "end": C.PartMeshes(base, [empty], whole=base)}
     assert C.evaluate_chamfer(one_state, gt, {0: 0}, count=500, seeds=(0,)).failures == 1
     assert set(report.to_dict()["static"]) == {"value", "floor"}
+
+
+def test_files_are_read_and_missing_ones_keep_their_place(tmp_path):
+    base, door = box((2, 2, 2)), box((0.5, 1, 1), (3, 0, 0))
+    base.export(tmp_path / "part_0.ply")
+    door.export(tmp_path / "part_2.ply")
+    meshes = C.read_part_meshes(None, tmp_path / "part_0.ply", [tmp_path / "part_1.ply", tmp_path / "part_2.ply"])
+    assert C.is_empty(meshes.movable[0])
+    assert C.surface_area(meshes.movable[1]) == pytest.approx(door.area)
+    assert C.surface_area(meshes.all) == pytest.approx(door.area + base.area)
+
+
+def test_ground_truth_of_a_real_object_scores_its_floor(scenes):
+    from p2gs.data.ground_truth import load_ground_truth
+
+    truth = load_ground_truth(scenes / "artgs" / "storage4")
+    gt = {n: C.read_part_meshes(p.whole, p.static, p.dynamic) for n, p in (("start", truth.start), ("end", truth.end))}
+    backwards = {n: C.PartMeshes(m.static, m.movable[::-1], m.whole) for n, m in gt.items()}
+    assignment = C.match_parts(backwards, gt)
+    assert assignment == {0: 2, 1: 1, 2: 0}
+    report = C.evaluate_chamfer(backwards, gt, assignment, seeds=(0,), clean=0.0)
+    for name in ("static", "movable", "whole"):
+        assert report.to_dict()[name]["value"] == pytest.approx(report.floors[name], rel=0.02)
+    assert report.floors["whole"] < C.sampling_floor(C.surface_area(gt["start"].whole))  # thin walls, modelled from both sides
