@@ -10,6 +10,8 @@
                  depth_median, depth_p90, depth_bad}: photographs that the fit did not train on where there are any; psnr_masked over
                  the object's pixels only, alpha_error mean |alpha - mask|, depth_* of |expected depth - true| on the object,
                  depth_bad the fraction off by more than 1 % of the object's diagonal
+    chamfer      {static|movable|whole: {value, floor}, parts, failures}: x1000, see metrics.chamfer.ChamferReport
+    penetration  {mean, max}: fraction of the moving Gaussians inside the base, over five states
     seconds      time the evaluation took
     missing      sentences
 """
@@ -19,18 +21,23 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import Optional
+from typing import TYPE_CHECKING, Optional
 
 import numpy as np
 import torch
 
+from p2gs.export.mesh import read_meshes
 from p2gs.export.paint import draw
 from p2gs.export.pose import pose
 from p2gs.export.twin_json import load_twin
 from p2gs.export.views import bounds
 from p2gs.metrics.joints import evaluate_joints
+from p2gs.metrics.penetration import evaluate_penetration
 from p2gs.ops.ssim import psnr, ssim
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError, View
+
+if TYPE_CHECKING:
+    from p2gs.data.ground_truth import GroundTruth
 
 FORMAT = "p2gs-metrics/1"
 STATES = ("start", "end")
@@ -54,7 +61,10 @@ def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict
     else:
         report = evaluate_joints([p.joint for p in obj.parts if p.joint is not None], truth.joints)
         metrics["joints"] = report.to_dict()
+        chamfer = surface_scores(run_dir, truth, {s.gt: s.pred for s in report.joints if s.pred is not None}, missing)
+        metrics |= {} if chamfer is None else {"chamfer": chamfer}
     metrics["views"] = view_scores(obj, scene, missing)
+    metrics["penetration"] = evaluate_penetration(obj)
     metrics["seconds"] = round(time.perf_counter() - began, 2)
     metrics["missing"] = missing
     path = run_dir / "metrics.json"
@@ -122,6 +132,31 @@ def one_view(gaussians, view: View, diagonal: float) -> dict[str, float]:
             row["depth_median"], row["depth_p90"] = (float(np.quantile(off, q)) for q in (0.5, 0.9))
             row["depth_bad"] = float((off > 0.01 * diagonal).mean())
     return row
+
+
+def surface_scores(run_dir: Path, truth: "GroundTruth", assignment: dict[int, int], missing: list[str]) -> Optional[dict]:
+    """Chamfer distances of RUN/meshes against the ground truth's; None where either is missing."""
+    from p2gs.metrics.chamfer import PartMeshes, evaluate_chamfer
+
+    pred, gt = {}, {}
+    for state, name in enumerate(STATES):
+        made, true = read_meshes(run_dir, name), truth.meshes(state)
+        if made is None:
+            missing.append("the run has no meshes (p2gs export RUN --format ply makes them)")
+            return None
+        if true.static is None or not true.dynamic:
+            missing.append(f"the ground truth has no meshes of the {name} state's parts")
+            return None
+        pred[name] = PartMeshes(made[0], made[1:])
+        whole = None if true.whole is None else _load(true.whole)
+        gt[name] = PartMeshes(_load(true.static), [_load(p) for p in true.dynamic], whole)
+    return evaluate_chamfer(pred, gt, assignment).to_dict()
+
+
+def _load(path: Path):
+    import trimesh
+
+    return trimesh.load(path, process=False, force="mesh")
 
 
 def _means(rows: list[dict]) -> dict[str, float]:

@@ -39,8 +39,7 @@ def chamfer_table(chamfer: Optional[dict]) -> Any:
         return None
     table = _table("Chamfer x1000", "value", "sampling floor")
     for name in ("static", "movable", "whole"):
-        if name in chamfer:
-            table.add_row(name, _num(chamfer[name]["value"]), _num(chamfer[name]["floor"]))
+        table.add_row(name, _num(chamfer[name]["value"]), _num(chamfer[name]["floor"]))
     return table
 
 

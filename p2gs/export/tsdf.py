@@ -193,7 +193,9 @@ class ActiveGrid:
             cell = shifted
         if not cell.any() or dense[known].min() >= 0 or dense[known].max() <= 0:
             return Mesh.empty()
-        vertices, faces, _, _ = marching_cubes(dense, 0.0, mask=cell, gradient_direction="ascent")
+        vertices, faces, _, _ = marching_cubes(
+            dense, 0.0, mask=cell, gradient_direction="descent"
+        )  # faces look to where the field is positive
         rgb = np.zeros((len(vertices), 4))
         for c in range(4):
             volume = np.zeros(self.shape, np.float32)

@@ -3,15 +3,17 @@
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from toy import start_parts, toy_scene, toy_twin
 
+from p2gs.data.ground_truth import GroundTruth, MeshPaths
 from p2gs.export import evaluate
 from p2gs.export.frame import object_to_input
+from p2gs.export.mesh import write_meshes
 from p2gs.export.paint import draw
 from p2gs.export.pose import pose
 from p2gs.export.run_folder import write_twin
@@ -37,7 +39,8 @@ def run(tmp_path, scene, monkeypatch):
 
     def make(twin=None, truth=True, scene=scene):
         write_twin(twin or toy_twin(), tmp_path, scene, media=False)
-        gt = SimpleNamespace(joints=start_parts()[1]) if truth else None
+        none = MeshPaths(None, None, ())
+        gt = GroundTruth(tmp_path, tuple(start_parts()[1]), none, none) if truth is True else truth
         monkeypatch.setattr(evaluate, "open_scene", lambda run_dir, root=None: (scene, gt))
         return tmp_path
 
@@ -48,7 +51,12 @@ def test_a_perfect_twin_scores_perfectly(run):
     folder = run()
     m = evaluate.evaluate_run(folder)
     assert json.loads((folder / "metrics.json").read_text()) == m
-    assert m["format"] == "p2gs-metrics/1" and m["num_parts"] == 3 and m["missing"] == []
+    assert (
+        m["format"] == "p2gs-metrics/1"
+        and m["num_parts"] == 3
+        and m["missing"] == ["the run has no meshes (p2gs export RUN --format ply makes them)"]
+    )
+    assert m["penetration"]["max"] <= 0.05
     assert m["joints"]["failures"] == 0 and m["joints"]["axis_angle_mean"] < 1e-4 and m["joints"]["motion_mean"] < 1e-4
     for name in ("start", "end"):
         v = m["views"][name]
@@ -83,10 +91,37 @@ def test_white_and_black_scores_are_those_of_composited_images(scene):
 
 def test_without_ground_truth_the_photographs_are_scored_and_the_rest_is_told(run, scene):
     views = [replace(v, depth=None) for v in scene.views if v.split == "train"]
-    m = evaluate.evaluate_run(run(truth=False, scene=scene.with_views(views)))
+    m = evaluate.evaluate_run(run(truth=None, scene=scene.with_views(views)))
     assert "joints" not in m and m["views"]["start"]["split"] == "train" and "depth_median" not in m["views"]["mean"]
     told = " ".join(m["missing"])
     assert "no ground-truth" in told and "no test views" in told and "no depth" in told
+
+
+def true_meshes(folder, t):
+    """The cabinet's panels as quads, as a ground-truth folder of one state."""
+    paths = []
+    for k in range(3):
+        g, ids = pose(toy_twin(), t), toy_twin().part_ids
+        g = g[ids == k]
+        u, v = (torch.eye(3)[g.log_scales.argsort(1, descending=True)[:, i]] * 0.025 for i in (0, 1))
+        a = t * math.radians(-70) if k == 1 else 0.0
+        R = torch.tensor([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
+        corners = torch.stack([g.means + s * (u @ R.T) + w * (v @ R.T) for s, w in ((-1, -1), (1, -1), (1, 1), (-1, 1))], 1).reshape(-1, 3)
+        quads = 4 * torch.arange(len(g))[:, None, None] + torch.tensor([[0, 1, 2], [0, 2, 3]])
+        mesh = trimesh.Trimesh(corners.numpy(), quads.reshape(-1, 3).numpy(), process=False)
+        paths.append(folder / f"{t}_{k}.ply")
+        mesh.export(paths[-1])
+    return MeshPaths(None, paths[0], tuple(paths[1:]))
+
+
+def test_meshes_are_scored_against_the_true_ones(run, tmp_path, scene):
+    folder = run(truth=GroundTruth(tmp_path, tuple(start_parts()[1]), true_meshes(tmp_path, 0.0), true_meshes(tmp_path, 1.0)))
+    write_meshes(folder, resolution=40)
+    c = evaluate.evaluate_run(folder)["chamfer"]
+    assert c["failures"] == 0 and len(c["parts"]) == 2
+    assert (
+        c["movable"]["floor"] < c["movable"]["value"] < 20 and c["static"]["value"] < 40 and c["whole"]["value"] < 40
+    )  # few coarse views: holes, but the right places
 
 
 def test_a_joint_not_found_is_a_failure_in_the_table(run):
