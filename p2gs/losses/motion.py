@@ -41,6 +41,11 @@ def squared(residual: Tensor, robust: float | None, extent: float) -> Tensor:
     return scale * sq / (scale + sq)
 
 
+def reduce_pairs(cost: Tensor, reduce: str, total: int) -> Tensor:
+    """Mean of the sampled costs [M], or the estimate of the sum over all ``total`` pairs."""
+    return cost.mean() if reduce == "mean" else cost.mean() * total
+
+
 @register_loss("vector")
 class Vector(Loss):
     """L_vector = sum_k sum_i p_ik |R_k mu0_i + t_k - mu1_i|^2 (paper section 4.4), i over observed pairs, slot 0 (the identity) too.
@@ -60,7 +65,7 @@ class Vector(Loss):
             return None
         cost = squared(se3.apply(inputs.parts.transforms, pairs.mu0) - pairs.mu1, self.robust, inputs.parts.extent)
         per_pair = (pairs.probs * cost.T).sum(-1)
-        return per_pair.mean() if self.reduce == "mean" else per_pair.sum()
+        return reduce_pairs(per_pair, self.reduce, len(inputs.parts.pairs))
 
 
 @register_loss("art")
@@ -114,7 +119,7 @@ class Art(Loss):
         else:
             cost = squared(self.push(moved, pairs.probs, parts, tau) - pairs.mu1, self.robust, parts.extent)
             per_pair = (pairs.probs * cost.T).sum(-1)
-        total = per_pair.mean() if self.reduce == "mean" else per_pair.sum()
+        total = reduce_pairs(per_pair, self.reduce, len(parts.pairs))
         if self.lambda_rot and parts.target_rotation is not None and len(parts.transforms) > 1:
             angle = so3.rotation_angle(parts.transforms[1:, :3, :3], parts.target_rotation[1:])
             total = total + self.lambda_rot * (angle.mean() if self.reduce == "mean" else angle.sum())

@@ -43,7 +43,7 @@ class Part(Loss):
             others = others.mean(1, keepdim=True)
         log_ratio = own.clamp_min(TINY).log()[:, None] - others.clamp_min(TINY).log()
         divergence = (own[:, None] * log_ratio).sum(-1).mean(1)
-        return divergence.mean() if self.reduce == "mean" else divergence.sum()
+        return divergence.mean() * (1 if self.reduce == "mean" else len(parts.probs))
 
 
 @register_loss("entropy")
