@@ -50,7 +50,7 @@ def rotation_of(quats: Tensor) -> Tensor:
 
 def _usable(a: RenderInputs) -> Tensor:
     """[N] bool: every input of the Gaussian is finite and its quaternion is not zero."""
-    given = [a.means, a.quats, a.scales, a.opacities[:, None], a.sh.flatten(1), *([] if a.features is None else [a.features])]
+    given = [a.means, a.quats, a.scales, a.opacities[:, None], a.sh[:, : (a.sh_degree + 1) ** 2].flatten(1), *([] if a.features is None else [a.features])]
     ok = torch.stack([t.detach().isfinite().all(1) for t in given]).all(0)
     return ok & (a.quats.detach().square().sum(1) > 0)
 
@@ -165,7 +165,8 @@ def rasterize_torch(a: RenderInputs) -> RenderOutput:
     if a.background is not None:
         colour = colour + T[..., None] * a.background.to(dtype)
     radii = torch.zeros(n, device=device, dtype=torch.int32)
-    radii[s.index] = s.extents.amax(1).ceil().to(torch.int32)
+    inside = ((high > 0) & (low < low.new_tensor([a.width, a.height]))).all(1)
+    radii[s.index] = torch.where(inside, s.extents.amax(1).ceil(), 0).to(torch.int32)
     return RenderOutput(
         colour=colour,
         alpha=1 - T,
