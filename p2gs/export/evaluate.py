@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Optional
 
 import numpy as np
-import torch
 
 from p2gs.export.mesh import read_meshes
 from p2gs.export.paint import draw

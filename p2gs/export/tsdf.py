@@ -184,6 +184,7 @@ class ActiveGrid:
         dense = np.ones(self.shape, np.float32)
         known = np.zeros(self.shape, bool)
         dense[i], known[i] = field[seen].numpy(), True
+        dense, known = fill_pinholes(dense, known)
         cell = known.copy()  # cell[x+1, y+1, z+1]: all corners x..x+1 known, which is where marching_cubes looks for its mask
         for axis in range(3):
             a, b = [slice(None)] * 3, [slice(None)] * 3
@@ -204,6 +205,21 @@ class ActiveGrid:
         rgb = rgb[:, :3] / np.maximum(rgb[:, 3:], 1e-6)
         world = self.origin.numpy() + vertices.astype(np.float64) * self.voxel
         return Mesh(world, faces.astype(np.int64), (np.clip(rgb, 0, 1) * 255).round().astype(np.uint8))
+
+
+def fill_pinholes(field: np.ndarray, known: np.ndarray, enough: float = 14 / 27, rounds: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Give unknown voxels that most neighbours surround (at least ``enough`` of the 3^3 cube) the known ones' mean.
+
+    Beyond the rim of an open surface a voxel has at most 9 known neighbours, so openings do not shrink.
+    """
+    from scipy.ndimage import uniform_filter
+
+    for _ in range(rounds):
+        share = uniform_filter(known.astype(np.float32), 3, mode="constant")
+        mean = uniform_filter(np.where(known, field, 0).astype(np.float32), 3, mode="constant") / np.maximum(share, 1e-6)
+        new = ~known & (share > enough - 1e-3)
+        field, known = np.where(new, mean, field), known | new
+    return field, known
 
 
 def largest_components(mesh: Mesh, fraction: float = 0.1) -> Mesh:

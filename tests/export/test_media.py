@@ -82,7 +82,7 @@ def test_cameras_json_round_trip(run):
     want = scene_cameras(toy_scene(SIM, n=6, size=96))
     got = read_cameras(run / "cameras.json")
     assert [(c.name, c.state, c.split) for c in got] == [(c.name, c.state, c.split) for c in want]
-    for a, b in zip(got, want):
+    for a, b in zip(got, want, strict=True):
         assert torch.allclose(a.camera.viewmat, b.camera.viewmat, atol=1e-6) and torch.allclose(a.camera.K, b.camera.K)
     assert read_cameras(run / "nothing.json") == []
 

@@ -42,7 +42,7 @@ def test_a_ball_comes_back_as_a_closed_ball():
     radius = np.linalg.norm(mesh.vertices, axis=1)
     assert abs(radius - RADIUS).max() < 0.5 * VOXEL and abs(radius.mean() - RADIUS) < 0.15 * VOXEL  # planes on a curved thing
     ball = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    assert ball.is_watertight and math.isclose(ball.volume, 4 / 3 * math.pi * RADIUS**3, rel_tol=0.03)  # > 0: faces look outward
+    assert ball.is_watertight and math.isclose(ball.volume, 4 / 3 * math.pi * RADIUS**3, rel_tol=0.05)  # > 0: faces look outward
     assert np.abs(mesh.colours / 255 - (mesh.vertices * 0.5 + 0.5)).max() < 0.06  # colours were painted by position
 
 

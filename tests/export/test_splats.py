@@ -72,7 +72,7 @@ def test_export_comes_back_in_input_coordinates():
     a, b = object_to_input(toy_twin()), object_to_input(toy_twin(SIM))
     for name in GaussianTensors.NAMES:
         assert torch.allclose(getattr(a.gaussians, name), getattr(b.gaussians, name), atol=1e-5), name
-    for p, q in zip(a.parts[1:], b.parts[1:]):
+    for p, q in zip(a.parts[1:], b.parts[1:], strict=True):
         assert torch.allclose(p.joint.transform, q.joint.transform, atol=1e-12)
         assert torch.allclose(p.joint.origin, q.joint.origin, atol=1e-12)
         assert math.isclose(p.joint.motion, q.joint.motion, rel_tol=1e-12)
@@ -167,7 +167,7 @@ def test_twin_json_is_the_contract_and_loads_back(tmp_path):
     back = load_twin(tmp_path)
     assert back.similarity == Similarity() and back.canonical_time == 0.0
     assert torch.allclose(back.gaussians.means, outer.gaussians.means) and torch.equal(back.part_ids, twin.part_ids)
-    for p, q in zip(back.parts[1:], outer.parts[1:]):
+    for p, q in zip(back.parts[1:], outer.parts[1:], strict=True):
         assert torch.equal(p.joint.transform, q.joint.transform) and p.confidence == q.confidence
 
     with pytest.raises(UserError, match="no finished run"):

@@ -10,6 +10,7 @@ import torch
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, Part, Similarity, TwoStateScene, View
 
 SPACING = 0.05
+NO_CHANGE = Similarity()
 
 
 def panel(corner, u, v, colour):
@@ -41,7 +42,7 @@ def box(lo, hi, colour, skip=()):
 
 
 def gaussians_of(panels, sh_degree=1) -> GaussianTensors:
-    means, scales, colours = (torch.tensor(np.concatenate(x), dtype=torch.float32) for x in zip(*panels))
+    means, scales, colours = (torch.tensor(np.concatenate(x), dtype=torch.float32) for x in zip(*panels, strict=True))
     n = len(means)
     sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
     sh[:, 0] = (colours - 0.5) / 0.28209479177387814
@@ -84,7 +85,7 @@ def start_parts():
     ]
 
 
-def toy_twin(similarity: Similarity = Similarity(), sh_degree=1, canonical_time=0.0) -> ArticulatedObject:
+def toy_twin(similarity: Similarity = NO_CHANGE, sh_degree=1, canonical_time=0.0) -> ArticulatedObject:
     """The cabinet as internal coordinates under ``similarity``. canonical_time 0: the Gaussians are the start state."""
     panels, joints = start_parts()
     sets = [gaussians_of(p, sh_degree) for p in panels]
@@ -125,7 +126,7 @@ def ring(n=8, size=100, radius=2.6, elevations=(20.0, 55.0)) -> list[Camera]:
     return cams
 
 
-def toy_scene(similarity: Similarity = Similarity(), n=8, size=100, render=None) -> TwoStateScene:
+def toy_scene(similarity: Similarity = NO_CHANGE, n=8, size=100, render=None) -> TwoStateScene:
     """Views around the cabinet in internal coordinates; ``render(state, camera) -> ([H, W, 3], [H, W])`` in 0..1 fills the images."""
     views = []
     for state in (0, 1):
