@@ -93,10 +93,10 @@ def _carve(views: Sequence[View], lo: np.ndarray, hi: np.ndarray, cells: int) ->
         keep = votes <= allowed
         if keep.sum() < 0.7 * len(points):
             points, votes = points[keep], votes[keep]
+        if len(points) == 0:
+            return np.empty((0, 3))
     points = points[votes <= allowed]
-    if len(points) == 0:
-        return np.empty((0, 3))
-    return np.stack([points.min(0) - step / 2, points.max(0) + step / 2])
+    return np.stack([points.min(0) - step / 2, points.max(0) + step / 2]) if len(points) else np.empty((0, 3))
 
 
 def object_box(views: Sequence[View], cells: int = 48) -> Tensor:
