@@ -9,10 +9,7 @@
 
 #include "adam.h"
 #include "ssim.h"
-#if __has_include("raster.h")
 #include "raster.h"
-#define P2GS_HAVE_RASTER 1
-#endif
 
 namespace p2gs {
 
@@ -20,9 +17,7 @@ struct Kernels {
     const char* isa;
     AdamKernels adam;
     SsimKernels ssim;
-#ifdef P2GS_HAVE_RASTER
     RasterKernels raster;
-#endif
 };
 
 namespace avx512 { extern const Kernels table; }

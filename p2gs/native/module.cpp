@@ -58,7 +58,5 @@ NB_MODULE(_native, m) {
         "Run `chunks` counting chunks of `work` steps; the number done, -1 where one was not done exactly once (for tests).");
     bind_adam(m);
     bind_ssim(m);
-#ifdef P2GS_HAVE_RASTER
     bind_raster(m);
-#endif
 }
