@@ -74,6 +74,7 @@ def parser(prog: str = "p2gs") -> Parser:
 
     view = add("view", "look at a run's twin in the browser")
     view.add_argument("run", metavar="RUN", help="result folder of a fit")
+    view.add_argument("--host", default="127.0.0.1", help="address to listen on (0.0.0.0: reachable from other machines)")
     view.add_argument("--port", type=int, default=8080)
 
     data = add("data", "check a scene folder or generate a scene")
@@ -141,9 +142,17 @@ def _carry_out(args: argparse.Namespace, rest: list[str]) -> int:
             from p2gs.commands.fit import fit
 
             return fit(args, rest)
-        from p2gs.commands import other
+        if args.command == "data":
+            from p2gs.commands.data import data
 
-        return getattr(other, args.command)(args)
+            return data(args)
+        if args.command == "bench":
+            from p2gs.bench.kernels import main
+
+            return main(args.words)
+        from p2gs.commands import runs
+
+        return getattr(runs, args.command)(args)
     except UserError as err:
         return _fail(str(err))
 

@@ -179,7 +179,9 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
     merged["data"] = {**(merged["data"] or {}), "format": current}
     values = complete(merged, schema)
     values.pop("p2gs")
-    for name, phase in (merged.get("phases") or {}).items():
+    phases = merged.get("phases") or {}
+    values["phases"] = {name: values["phases"][name] for name in dict.fromkeys([*phases, *values["phases"]])}  # in the order of the files
+    for name, phase in phases.items():
         if phase is not None and "callbacks" in values["phases"][name]:  # a phase's callbacks say only what differs from the top
             given = complete(phase.get("callbacks") or {}, schema.children["callbacks"])
             values["phases"][name]["callbacks"] = _mentioned(given, phase.get("callbacks") or {})

@@ -17,8 +17,8 @@ from p2gs.types import ArticulatedObject, UserError
 
 
 def splat_arrays(obj: ArticulatedObject, part: int) -> dict[str, np.ndarray]:
-    """What viser draws of the ``part``-th part at canonical time: centers [n, 3], covariances [n, 3, 3], rgbs [n, 3] in 0..1 (direct colour,
-    no view dependence), opacities [n, 1]; float32."""
+    """What viser draws of the ``part``-th part at canonical time, float32: centers [n, 3], covariances [n, 3, 3], rgbs [n, 3] in 0..1
+    (without view dependence), opacities [n, 1]."""
     g = obj.gaussians[obj.part_ids == obj.parts[part].id]
     RS = quat_to_matrix(g.quats) * g.log_scales.exp()[:, None, :]
     arrays = {

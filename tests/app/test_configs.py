@@ -1,0 +1,74 @@
+"""The configs that come with p2gs, against what is really registered; the README's example of a loss."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from p2gs.config import load_config
+
+REPOSITORY = Path(__file__).parents[2]
+CONFIGS = REPOSITORY / "configs"
+
+
+def files(folder: str) -> list[str]:
+    return sorted(str(p.relative_to(CONFIGS)) for p in (CONFIGS / folder).glob("*.yaml"))
+
+
+def test_the_folders_are_not_empty():
+    assert {f"preset/{name}.yaml" for name in ("cpu", "gpu", "paper", "paper_literal", "smoke")} <= set(files("preset"))
+    assert {"data/paris.yaml", "data/dta.yaml", "data/artgs.yaml"} <= set(files("data")) and len(files("ablation")) >= 5
+
+
+@pytest.mark.parametrize("name", ["demo.yaml", *files("preset")])
+def test_presets_name_every_stage(name):
+    cfg = load_config([name])
+    assert list(cfg.phases) == ["single_state", "discovery", "canonical_fusion", "articulation", "finish"]
+    for phase in ("single_state", "canonical_fusion", "articulation"):
+        assert "render" in cfg.phases[phase].losses
+        assert {"progress", "scalars", "checkpoint", "evaluation"} <= set(cfg.phases[phase].callbacks)
+
+
+@pytest.mark.parametrize("name", files("data"))
+def test_data_configs_name_a_format(name):
+    cfg = load_config(["preset/cpu.yaml", name])
+    assert cfg.data_options["format"] == Path(name).stem
+
+
+@pytest.mark.parametrize("name", files("ablation"))
+def test_ablations_change_the_result_of_the_preset_they_are_laid_on(name):
+    plain, ablated = load_config(["preset/cpu.yaml"]), load_config(["preset/cpu.yaml", name])
+    assert list(plain.phases) == list(ablated.phases)
+    assert any(plain.section(p) != ablated.section(p) for p in plain.phases)
+
+
+def test_every_loss_and_callback_of_the_default_can_be_null():
+    plain = load_config(["preset/cpu.yaml"])
+    words = [f"--phases.{p}.losses.{name}" for p, section in plain.phases.items() for name in section.losses]
+    words += [f"--phases.{p}.callbacks.{name}" for p, section in plain.phases.items() for name in section.callbacks]
+    assert len(words) > 20
+    cfg = load_config(["preset/cpu.yaml"], [part for word in words for part in (word, "null")])
+    assert all(not section.losses and not section.callbacks for section in cfg.phases.values())
+
+
+def test_the_paper_says_these_numbers():
+    literal = load_config(["preset/paper_literal.yaml"])
+    assert literal.phases["single_state"].config.steps == 30000 and literal.phases["canonical_fusion"].config.steps == 5000
+    articulation = literal.phases["articulation"]
+    weights = {name: loss.weight for name, loss in articulation.losses.items()}
+    assert weights == {"render": 1.0, "part": 0.1, "art": 1.0, "contact": 0.5, "velocity": 0.5, "vector": 0.5}
+    assert articulation.config.rate_screws == 1e-3 and articulation.config.repel.count == 2000
+
+
+def test_the_loss_of_the_readme_is_found_and_switched_on(tmp_path, monkeypatch):
+    from p2gs.losses.base import LOSSES
+
+    text = (REPOSITORY / "README.md").read_text()
+    python, yaml = re.search(r"```python\n(.*?)```.*?```yaml\n(.*?)```", text, re.S).groups()
+    (tmp_path / "my_losses_of_readme.py").write_text(python)
+    (tmp_path / "mine.yaml").write_text(yaml)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(LOSSES, "_items", dict(LOSSES.items()))
+    cfg = load_config(["preset/cpu.yaml", "mine.yaml"], plugins=["my_losses_of_readme"])
+    assert cfg.phases["single_state"].losses["round"].weight == 0.02
+    assert "render" in cfg.phases["single_state"].losses and "round" not in cfg.phases["articulation"].losses

@@ -1,0 +1,112 @@
+"""The house rules that a reader relies on: imports point one way, an optional dependency lives in one file, help needs no torch."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "p2gs"
+
+# what is imported stands in an earlier row, or in the same one
+ORDER = [
+    ("types", "registry"),
+    ("schema", "config_files"),
+    ("ops", "native"),
+    ("render",),
+    ("losses", "metrics", "data"),
+    ("models",),
+    ("export", "callbacks"),
+    ("config",),
+    ("pipeline", "bench"),
+    ("app", "commands"),
+    ("cli", "__main__"),
+]
+RANK = {name: row for row, names in enumerate(ORDER) for name in names}
+APART = [("losses", "metrics"), ("losses", "data"), ("metrics", "losses"), ("metrics", "data"), ("data", "losses"), ("data", "metrics")]
+# (importer, imported): why
+ALLOWED = {
+    ("p2gs.export.evaluate", "p2gs.config"): "the scene of a run is read from its config.yaml",
+}
+OPTIONAL = ["gsplat", "viser", "imageio_ffmpeg", "pxr", "mujoco", "yourdfpy", "embreex", "hypothesis", "beartype"]
+
+
+def modules():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
+
+
+def imports(path: Path, name: str) -> set[str]:
+    """Every module imported anywhere in a file, those inside functions too, by full name."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: relative import; the house writes full names"
+            found.add(node.module)
+            if node.module == "p2gs":
+                found |= {f"p2gs.{alias.name}" for alias in node.names if alias.name in RANK}
+    return found
+
+
+def house_imports():
+    for name, path in modules():
+        if name == "p2gs":
+            continue
+        for target in imports(path, name):
+            if target.startswith("p2gs."):
+                yield name, target
+
+
+def test_every_module_has_a_place_in_the_order():
+    assert {name.split(".")[1] for name, _ in modules() if name != "p2gs"} <= set(RANK)
+
+
+def test_imports_point_one_way():
+    wrong = []
+    for name, target in house_imports():
+        a, b = name.split(".")[1], target.split(".")[1]
+        if RANK[b] > RANK[a] and (name, target) not in ALLOWED:
+            wrong.append(f"{name} imports {target}")
+    assert not wrong, wrong
+
+
+def test_losses_metrics_and_data_do_not_know_each_other():
+    assert not [f"{a} imports {b}" for a, b in house_imports() if (a.split(".")[1], b.split(".")[1]) in APART]
+
+
+def test_ground_truth_is_opened_for_scoring_only():
+    """No training code reads ground truth: the evaluation command and callback do, and the dataset check and writer."""
+    readers = {a for a, b in house_imports() if b == "p2gs.data.ground_truth"}
+    allowed = ("p2gs.export.evaluate", "p2gs.callbacks.evaluation", "p2gs.data.", "p2gs.bench.")
+    assert not [r for r in readers if not r.startswith(allowed)], readers
+    assert not readers & {"p2gs.data.base", "p2gs.data.modules", "p2gs.data.images", "p2gs.data.views"}
+
+
+@pytest.mark.parametrize("dependency", OPTIONAL)
+def test_an_optional_dependency_is_imported_in_one_file(dependency):
+    users = [name for name, path in modules() if any(t.split(".")[0] == dependency for t in imports(path, name))]
+    assert len(users) <= 1, users
+
+
+def test_no_import_of_what_breaks_lightning():
+    """torchvision, lpips: a build that does not match torch's breaks Lightning's imports. open3d, pytorch3d, plyfile (GPL): by design."""
+    banned = {"torchvision", "lpips", "open3d", "pytorch3d", "plyfile"}
+    assert not [name for name, path in modules() if {t.split(".")[0] for t in imports(path, name)} & banned]
+
+
+def test_the_registries_import_without_heavy_libraries():
+    """What every `p2gs fit` waits for: no mesh, image or plotting library before it is needed."""
+    code = """
+import sys
+from p2gs.config import import_builtins
+import_builtins()
+heavy = {"trimesh", "skimage", "cv2", "viser", "gsplat"} & set(sys.modules)
+print(sorted(heavy))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"
