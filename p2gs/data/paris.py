@@ -63,9 +63,10 @@ def ground_truth_folder(root: Path, source: Optional[str] = None) -> Optional[Pa
     if source is not None:
         folder = root / "data" / source / "textured_objs"
         return folder if folder.is_dir() else None
-    for top in root.resolve().parents:  # root is the inner folder: .../load/<source>
+    inner = root.resolve()
+    for top in (inner, *inner.parents):  # root is the inner folder: .../load/<source>
         if top.name == "load":
-            folder = top.parent / "data" / root.resolve().relative_to(top) / "textured_objs"
+            folder = top.parent / "data" / inner.relative_to(top) / "textured_objs"
             return folder if folder.is_dir() else None
     return None
 
