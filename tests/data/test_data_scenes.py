@@ -40,6 +40,7 @@ def splatted_depth(view, points):
 
 def cast(view, mesh, rows, cols):
     """z of the mesh along the rays through pixel centres, nan where they miss."""
+    pytest.importorskip("embreex", reason="casts rays at triangles")
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
     K, M = view.camera.K.double().numpy(), view.camera.viewmat.double().numpy()
