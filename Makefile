@@ -17,14 +17,15 @@ setup-dev: .venv/.dev .venv/.built
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/pip install -q -c constraints.txt torch
 	$(BIN)/pip install -q -c constraints.txt -e .
-	touch $@ .venv/.built
+	touch $@
 
 .venv/.dev: .venv/.deps
 	$(BIN)/pip install -q -c constraints.txt -e ".[dev]"
-	touch $@ .venv/.built
+	touch $@
 
+# Kernels that are newer than the last installation.
 .venv/.built: .venv/.deps CMakeLists.txt $(NATIVE)
-	$(BIN)/pip install -q --no-deps -e .
+	test -z "$$(find CMakeLists.txt $(NATIVE) -newer .venv/.deps)" || $(BIN)/pip install -q --no-deps -e .
 	touch $@
 
 # The extension alone, in seconds, for work on the C++ (after setup-dev).

@@ -4,14 +4,15 @@
 
 namespace p2gs {
 
-// One tensor of an Adam step. step_size = lr / (1 - beta1^t); bias2_sqrt = sqrt(1 - beta2^t).
+// One tensor of an Adam step. step_size = lr / (1 - beta1^t); bias2_sqrt = sqrt(1 - beta2^t). The differences from one are
+// taken in double precision: 1 - 0.999f is wrong in the fifth digit.
 struct AdamTensor {
     float* param;
     const float* grad;
     float* exp_avg;
     float* exp_avg_sq;
     int64_t size;
-    float step_size, beta1, beta2, eps, bias2_sqrt;
+    float step_size, one_minus_beta1, beta2, one_minus_beta2, eps, bias2_sqrt;
 };
 
 struct AdamKernels {

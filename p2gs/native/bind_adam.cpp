@@ -11,14 +11,14 @@
 namespace p2gs {
 
 void bind_adam(nb::module_& m) {
-    using Item = std::tuple<Address, Address, Address, Address, int64_t, float, float, float, float, float>;
+    using Item = std::tuple<Address, Address, Address, Address, int64_t, float, double, double, float, float>;
     m.def(
         "adam_step",
         [](const std::vector<Item>& items, int threads) {
             std::vector<AdamTensor> tensors;
             for (const auto& [p, g, m1, v, size, step_size, beta1, beta2, eps, bias2_sqrt] : items)
                 tensors.push_back({pointer<float>(p), pointer<const float>(g), pointer<float>(m1), pointer<float>(v), size, step_size,
-                                   beta1, beta2, eps, bias2_sqrt});
+                                   float(1 - beta1), float(beta2), float(1 - beta2), eps, bias2_sqrt});
             nb::gil_scoped_release release;
             adam_step(tensors.data(), int(tensors.size()), threads);
         },
