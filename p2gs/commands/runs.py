@@ -10,7 +10,7 @@ from p2gs.registry import suggest
 from p2gs.types import UserError
 
 # what fit does not write by itself: name -> (module, function of the run folder)
-FORMATS = {"meshes": ("p2gs.export.mesh", "write_meshes")}
+FORMATS = {"ply": ("p2gs.export.mesh", "write_meshes")}
 
 
 def finished_run(folder: str) -> Path:

@@ -35,13 +35,6 @@ def test_data_configs_name_a_format(name):
     assert cfg.data_options["format"] == Path(name).stem
 
 
-@pytest.mark.parametrize("name", files("ablation"))
-def test_ablations_change_the_result_of_the_preset_they_are_laid_on(name):
-    plain, ablated = load_config(["preset/cpu.yaml"]), load_config(["preset/cpu.yaml", name])
-    assert list(plain.phases) == list(ablated.phases)
-    assert any(plain.section(p) != ablated.section(p) for p in plain.phases)
-
-
 def test_every_loss_and_callback_of_the_default_can_be_null():
     plain = load_config(["preset/cpu.yaml"])
     words = [f"--phases.{p}.losses.{name}" for p, section in plain.phases.items() for name in section.losses]

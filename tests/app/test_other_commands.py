@@ -60,7 +60,7 @@ def test_test_needs_the_config_of_the_run(twin, capsys):
 
 
 def test_export_names_the_formats(twin, capsys):
-    assert "there is no 'mesh' (did you mean 'meshes'?)" in failure(capsys, "export", str(twin[0]), "--format", "mesh")
+    assert "there is no 'plyy' (did you mean 'ply'?)" in failure(capsys, "export", str(twin[0]), "--format", "plyy")
 
 
 def test_view_without_viser_says_what_to_install(twin, capsys, monkeypatch):
