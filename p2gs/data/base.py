@@ -15,9 +15,9 @@ from typing import Iterator, Literal, Optional, Sequence, TypeVar
 import numpy as np
 from lightning.pytorch import LightningDataModule
 
-from p2gs.data.box import farthest_cameras, normalise
+from p2gs.data.box import farthest_cameras, normalise, object_box
 from p2gs.data.frames import Frame
-from p2gs.data.images import DepthMode, read_views
+from p2gs.data.images import DepthMode, check_sizes, read_views
 from p2gs.data.report import Report, StrictReport
 from p2gs.data.views import view_index
 from p2gs.registry import Registry
@@ -78,19 +78,22 @@ class TwoStateData(LightningDataModule):
             raise UserError(f"data.downscale is {downscale:g}, but it divides the image size and must be at least 1")
         if max_views is not None and max_views < 1:
             raise UserError(f"data.max_views is {max_views}, but it must be at least 1")
-        self.root, self.downscale, self.max_views = root, downscale, max_views
+        self.root: Optional[str] = root
+        self.downscale, self.max_views = downscale, max_views
         self.depth, self.seed, self.normalize = depth, seed, normalize
         self._raw: Optional[TwoStateScene] = None
         self._scene: Optional[TwoStateScene] = None
 
     def read(self) -> TwoStateScene:
         """The scene in input units. Raises UserError for the first problem met in the files."""
-        root = Path(self.root)
+        root = Path(self.root or "")
         if not root.is_dir():
             raise UserError(f"{root}: scene folder is missing")
         report = StrictReport()
         frames = thin_out(self.index(root, report), self.max_views)
-        return TwoStateScene(root.resolve().name, tuple(read_views(frames, report, self.downscale, self.depth)))
+        views = read_views(frames, report, self.downscale, self.depth)
+        check_sizes(frames, views, report)
+        return TwoStateScene(root.resolve().name, tuple(views))
 
     def index(self, root: Path, report: Report) -> list[Frame]:
         """The scene's frames (layouts on disk override this)."""
@@ -105,7 +108,7 @@ class TwoStateData(LightningDataModule):
     def scene(self) -> TwoStateScene:
         """The scene as training sees it: internal units, ``box`` set; made once. ``similarity`` leads back to input units."""
         if self._scene is None:
-            raw = self.raw_scene()
+            raw = self._raw or self.read()  # not kept: depth would be held twice
             self._scene = normalise(raw) if self.normalize == "object" else with_box(raw)
         return self._scene
 
@@ -119,8 +122,6 @@ class TwoStateData(LightningDataModule):
 
 def with_box(scene: TwoStateScene) -> TwoStateScene:
     """The same scene, its box found from the masks."""
-    from p2gs.data.box import object_box
-
     return TwoStateScene(scene.name, scene.views, scene.similarity, object_box(scene.select(split="train")))
 
 

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Optional
 
+import torch
+
 from p2gs.data.box import object_box
 from p2gs.data.frames import STATES
-from p2gs.data.images import read_views
+from p2gs.data.images import check_sizes, read_views
 from p2gs.data.layouts import detect_format, layout_named
 from p2gs.data.report import Finding, Report
 from p2gs.types import UserError, View
+
+CHUNK = 32  # views whose colours are held at a time
+
+
+def _slim(view: View) -> View:
+    """The view without colours and depth values: what the box and the summary need."""
+    nothing = torch.empty(0)
+    return replace(view, image=nothing, depth=None if view.depth is None else nothing)
 
 
 def _summary(root: Path, format: str, views: list[View]) -> str:
@@ -41,7 +52,10 @@ def check_dataset(root, format: Optional[str] = None, source: Optional[str] = No
         return report.findings
     layout = layout_named(format)
     frames = layout.index(root, report, source) if format == "paris" else layout.index(root, report)
-    views = read_views(frames, report)
+    views: list[View] = []
+    for i in range(0, len(frames), CHUNK):
+        views += [_slim(v) for v in read_views(frames[i : i + CHUNK], report)]
+    check_sizes(frames, views, report)
     if not report.failed:
         try:
             object_box([v for v in views if v.split == "train"])

@@ -163,6 +163,20 @@ def read_view(frame: Frame, report: Report, downscale: float = 1.0, depth: Depth
     )
 
 
+def check_sizes(frames: Sequence[Frame], views: Sequence[View], report: Report) -> None:
+    """One K is for one image size: an error names the first image that differs from those that share its K."""
+    read = {(v.state, v.split, v.name): (v.camera.width, v.camera.height) for v in views}
+    first: dict = {}
+    for f in frames:
+        size = read.get((f.state, f.split, f.name))
+        if f.K is None or size is None:
+            continue
+        other, name = first.setdefault((f.K_source, f.K.tobytes()), (size, f.image.name))
+        if size != other:
+            report.error(f"{f.image}: is {size[0]}x{size[1]} pixels, but {name} with the same K is {other[0]}x{other[1]}")
+            return
+
+
 def read_views(frames: Sequence[Frame], report: Report, downscale: float = 1.0, depth: DepthMode = "auto") -> list[View]:
     """All frames that can be read, in order. Files are decoded by a few threads; findings keep the order of the frames."""
     import cv2

@@ -74,7 +74,8 @@ class SyntheticData(TwoStateData):
         seed: int = 0,
         normalize: Literal["object", "none"] = "object",
     ):
-        super().__init__(root, downscale, max_views, depth, seed, normalize)
+        super().__init__(root or "", downscale, max_views, depth, seed, normalize)
+        self.root = root
         self.kind, self.object_seed, self.size = kind, object_seed, size
         self.train_views, self.test_views = train_views, test_views
 

@@ -138,6 +138,11 @@ FAULTS = {
         cameras(lambda c: c.update(K=[[111, 0, 80], [0, 111, 80], [0, 0, 1]])),
         "K does not fit the 40x40 image 0000.png, its principal point (80.0, 80.0) lies outside",
     ),
+    "one K, two sizes": (
+        "paris",
+        picture("load/end/train/0002.png", lambda i: i[:30]),
+        "0002.png: is 40x30 pixels, but 0000.png",
+    ),
     "PARIS K broken": (
         "paris",
         cameras(lambda c: c.update(K=[[0, 0, 20], [0, 1, 20], [0, 0, 1]])),
