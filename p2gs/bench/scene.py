@@ -14,7 +14,7 @@ from p2gs.types import Camera
 
 @dataclass
 class BenchScene:
-    """Arguments of ``render.rasterize`` (activated values, float32): means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, 16, 3]."""
+    """Arguments of ``render.rasterize`` (activated values, float32): means, scales [N, 3], quats [N, 4], opacities [N], sh [N, 16, 3]."""
 
     means: Tensor
     quats: Tensor

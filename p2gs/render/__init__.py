@@ -14,6 +14,7 @@ from typing import Optional
 from torch import Tensor
 
 from p2gs.native import native, warn_missing_once
+from p2gs.registry import suggest
 from p2gs.render.base import RASTERIZERS, Rasterizer, RenderInputs, check
 from p2gs.types import RenderOutput, UserError
 
@@ -25,7 +26,9 @@ _warned: set[str] = set()
 
 def find_rasterizer(name: str) -> Rasterizer:
     """The backend registered under ``name``. Raises UserError when it is unknown or cannot run here."""
-    if name not in RASTERIZERS and name in _BUILT_IN:
+    if name not in RASTERIZERS:
+        if name not in _BUILT_IN:
+            raise UserError(f"unknown rasterizer '{name}'{suggest(name, {*RASTERIZERS, *_BUILT_IN})}")
         importlib.import_module(f"p2gs.render.{name}")
     return RASTERIZERS[name]
 
