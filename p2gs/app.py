@@ -70,7 +70,11 @@ def parser(prog: str = "p2gs") -> Parser:
 
     export = add("export", "write a run's twin in other formats")
     export.add_argument("run", metavar="RUN", help="result folder of a fit")
-    export.add_argument("--format", nargs="+", default=["all"], metavar="NAME", help="formats to write (default all)")
+    export.add_argument("--format", nargs="+", default=["all"], metavar="NAME", help="urdf, mjcf, glb, usd, ply, obj, all (default)")
+    export.add_argument("--out", metavar="DIR", help="folder to write to (default RUN)")
+    export.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of the input (default 1)")
+    export.add_argument("--up", choices=("x", "y", "z"), help="axis that points up in the file (default: the format's own)")
+    export.add_argument("--origin", choices=("keep", "center", "bottom"), default="keep", help="where the origin is put (default keep)")
 
     view = add("view", "look at a run's twin in the browser")
     view.add_argument("run", metavar="RUN", help="result folder of a fit")

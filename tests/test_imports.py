@@ -1,6 +1,7 @@
 """The house rules that a reader relies on: imports point one way, an optional dependency lives in one file, help needs no torch."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -38,7 +39,8 @@ def modules():
         yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
 
 
-def imports(path: Path, name: str) -> set[str]:
+@functools.cache
+def imports(path: Path) -> set[str]:
     """Every module imported anywhere in a file, those inside functions too, by full name."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -56,7 +58,7 @@ def house_imports():
     for name, path in modules():
         if name == "p2gs":
             continue
-        for target in imports(path, name):
+        for target in imports(path):
             if target.startswith("p2gs."):
                 yield name, target
 
@@ -88,14 +90,14 @@ def test_ground_truth_is_opened_for_scoring_only():
 
 @pytest.mark.parametrize("dependency", OPTIONAL)
 def test_an_optional_dependency_is_imported_in_one_file(dependency):
-    users = [name for name, path in modules() if any(t.split(".")[0] == dependency for t in imports(path, name))]
+    users = [name for name, path in modules() if any(t.split(".")[0] == dependency for t in imports(path))]
     assert len(users) <= 1, users
 
 
 def test_no_import_of_what_breaks_lightning():
     """torchvision, lpips: a build that does not match torch's breaks Lightning's imports. open3d, pytorch3d, plyfile (GPL): by design."""
     banned = {"torchvision", "lpips", "open3d", "pytorch3d", "plyfile"}
-    assert not [name for name, path in modules() if {t.split(".")[0] for t in imports(path, name)} & banned]
+    assert not [name for name, path in modules() if {t.split(".")[0] for t in imports(path)} & banned]
 
 
 def test_the_registries_import_without_heavy_libraries():

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from importlib import import_module
 from pathlib import Path
 
-from p2gs.registry import suggest
 from p2gs.types import UserError
-
-# what fit does not write by itself: name -> (module, function of the run folder)
-FORMATS = {"ply": ("p2gs.export.mesh", "write_meshes")}
 
 
 def finished_run(folder: str) -> Path:
@@ -59,14 +54,12 @@ def view(args: argparse.Namespace) -> int:
 
 
 def export(args: argparse.Namespace) -> int:
-    """Other formats of the twin, written into the run folder."""
+    """Other formats of the twin; prints the files."""
+    from p2gs.export.formats import export_run
+
     run = finished_run(args.run)
-    names = list(FORMATS) if args.format == ["all"] else args.format
-    for name in names:
-        if name not in FORMATS:
-            raise UserError(f"export --format: there is no '{name}'{suggest(name, [*FORMATS, 'all'])}")
-    for name in names:
-        module, function = FORMATS[name]
-        getattr(import_module(module), function)(run)
-        print(f"{name}: written to {run}")
+    if not args.scale > 0:
+        raise UserError(f"--scale: expected a positive number of metres per unit, got {args.scale:g}")
+    for path in export_run(run, args.format, out=args.out, scale=args.scale, up=args.up, origin=args.origin):
+        print(path)
     return 0

@@ -60,7 +60,8 @@ def test_test_needs_the_config_of_the_run(twin, capsys):
 
 
 def test_export_names_the_formats(twin, capsys):
-    assert "there is no 'plyy' (did you mean 'ply'?)" in failure(capsys, "export", str(twin[0]), "--format", "plyy")
+    assert "unknown export format 'urfd' (did you mean 'urdf'?)" in failure(capsys, "export", str(twin[0]), "--format", "urfd")
+    assert "--scale: expected a positive number" in failure(capsys, "export", str(twin[0]), "--scale", "0")
 
 
 def test_view_without_viser_says_what_to_install(twin, capsys, monkeypatch):
