@@ -26,7 +26,7 @@ from p2gs.types import GaussianTensors
 class RepelConfig:
     """Repel points (paper section 4.3, appendix). count: N_R.  threshold: how near to the static base a movable part must be,
     by ``threshold_mode`` ("relative" to the box diagonal, "absolute", or in "spacing"s).  noise: standard deviation of their
-    placement, relative to the diagonal. Placed at the start; the callback ``repel`` places them anew (the dynamic variant)."""
+    first placement, relative to the diagonal. The callback ``repel`` places them anew, without noise (the dynamic variant)."""
 
     count: int = 2000
     threshold: float = 0.05
@@ -192,9 +192,10 @@ class ArticulationPhase(ImagePhase):
         static, movable = at[labels == 0], at[labels > 0]
         r = self.config.repel
         self.repel_points = torch.zeros(0, 3)
+        noise = r.noise * self.extent if step == 0 else 0.0
         if r.count > 0 and min(len(static), len(movable)) > 0:
             self.repel_points = place_repel_points(
-                static, movable, r.count, r.threshold, r.threshold_mode, r.noise * self.extent, self.generator(step, 4), extent=self.extent
+                static, movable, r.count, r.threshold, r.threshold_mode, noise, self.generator(step, 4), extent=self.extent
             )
 
     def on_load_checkpoint(self, checkpoint) -> None:

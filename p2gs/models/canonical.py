@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -22,15 +23,16 @@ class CanonicalConfig:
     paper's letter: raw centres are matched and a pair is joined by a chord. match_size: farthest points per state that are matched.
     fusion: "union" keeps the Gaussians of the motion-rich state and adds what only the other state saw; "paper" replaces matched
     Gaussians by beta-weighted averages of all parameters and keeps unmatched ones by ``unmatched``: "static" (those of the
-    motion-rich state that did not move), "none" or "all".
+    motion-rich state that did not move), "none" or "all". "none" is the ablation without canonical initialisation: the start
+    state's Gaussians as they are, at canonical time 0, with no observed pairs.
     min_opacity: fainter Gaussians take no part in D and matching.  trim: fraction of the largest distances left out of D (floaters).
     """
 
-    beta: str = "global"
-    correspondence: str = "motion"
+    beta: Literal["global", "uniform", "per_part"] = "global"
+    correspondence: Literal["motion", "hungarian"] = "motion"
     match_size: int = 3000
-    fusion: str = "union"
-    unmatched: str = "static"
+    fusion: Literal["union", "paper", "none"] = "union"
+    unmatched: Literal["static", "none", "all"] = "static"
     min_opacity: float = 0.5
     trim: float = 0.02
 
@@ -112,6 +114,8 @@ def fuse(g0: GaussianTensors, g1: GaussianTensors, motions: PartMotions | None, 
     p0, p1 = g0.means[solid[0]], g1.means[solid[1]]
     if min(len(p0), len(p1)) < 10:
         raise UserError(f"canonical_fusion: only {min(len(p0), len(p1))} Gaussians of a state are opaque; expected a reconstructed object (train single_state longer)")
+    if config.fusion == "none":
+        return _start_state_only(g0, motions)
     d01, d10 = motion_richness(p0, p1, config.trim), motion_richness(p1, p0, config.trim)
     parts = 1 + (len(motions) if motions is not None else 0)
     betas = torch.full((parts,), 0.5 if config.beta == "uniform" else beta_weight(d01, d10), dtype=torch.float64)
@@ -125,6 +129,15 @@ def fuse(g0: GaussianTensors, g1: GaussianTensors, motions: PartMotions | None, 
     if motions is None or config.correspondence == "hungarian":
         return _fuse_chords(g0, g1, motions, solid, betas, d01 >= d10, config)
     return _fuse_motions(g0, g1, motions, solid, betas, d01 >= d10, config)
+
+
+def _start_state_only(g0, motions) -> CanonicalGaussians:
+    """No canonical initialisation: beta = 1 puts canonical time at the start state."""
+    betas = torch.ones(1 + (len(motions) if motions is not None else 0), dtype=torch.float64)
+    labels = motions.labels[0] if motions is not None else torch.zeros(len(g0), dtype=torch.int64)
+    margin = motions.margin[0] if motions is not None else torch.zeros(len(g0))
+    nothing = torch.zeros(0, 3)
+    return _with_pairs(g0, betas, labels, margin, torch.zeros(0, dtype=torch.int64), nothing, nothing)
 
 
 def _fuse_chords(g0, g1, motions, solid, betas, start_is_rich, config) -> CanonicalGaussians:
