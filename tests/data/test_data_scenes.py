@@ -54,7 +54,7 @@ def cast(view, mesh, rows, cols):
 
 @PARAMS
 def test_gt_mesh_projects_into_masks_and_fills_them(scenes, format, path, count, has_depth):
-    scene = DATASETS[format](root=str(scenes / path), max_views=3).raw_scene()
+    scene = DATASETS[format](root=str(scenes / path), max_views=2).raw_scene()
     truth = load_ground_truth(scenes / path, format)
     for state in (0, 1):
         mesh = trimesh.load(truth.meshes(state).whole)
