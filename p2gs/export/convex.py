@@ -1,0 +1,150 @@
+"""Convex pieces of a surface, for collision: small cells of it, merged while the merged hull encloses little that is not theirs.
+
+Works on open shells, as scanned surfaces are: a cabinet's shell becomes its panels, a door stays one piece. (Bottom-up as in
+Mamou and Ghorbel 2009, doi:10.1109/ICIP.2009.5414068, with grid cells in place of triangles.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Optional
+
+import numpy as np
+
+POINTS = 12000  # of the surface that the pieces are made from
+CELLS = 8  # along the longest side
+CORNERS = 128  # directions whose outermost points make a piece's hull
+
+
+@dataclass
+class Piece:
+    """A convex polyhedron. vertices [V, 3] float64, faces [F, 3] int64, outward."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+    @property
+    def volume(self) -> float:
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+    def planes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Outward normals [F, 3] and offsets [F]: inside is n . x <= d."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        n = np.cross(b - a, c - a)
+        n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+        return n, np.einsum("ij,ij->i", n, a)
+
+
+def hull(points: np.ndarray, min_thickness: float) -> Piece:
+    """Convex hull of points [N, 3], made at least ``min_thickness`` thick across its thinnest direction."""
+    from scipy.spatial import ConvexHull
+
+    center = points.mean(0)
+    axes = np.linalg.svd(points - center, full_matrices=False)[2] if len(points) >= 3 else np.eye(3)
+    local = (points - center) @ axes.T
+    for i in range(3):
+        lack = min_thickness - np.ptp(local[:, i])
+        if lack > 0:
+            shift = np.zeros(3)
+            shift[i] = lack / 2
+            local = np.concatenate([local - shift, local + shift])
+    local = local[outermost(local)]
+    found = ConvexHull(local, qhull_options="QJ Pp")
+    used, faces = np.unique(found.simplices, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    vertices = local[used] @ axes + center
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - vertices.mean(0)) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return Piece(vertices, faces.astype(np.int64))
+
+
+def outermost(points: np.ndarray) -> np.ndarray:
+    """Indices of the points that are the furthest out in some of ``CORNERS`` directions (a coarse hull), and of the box's corners."""
+    i = np.arange(CORNERS) + 0.5
+    polar, turn = np.arccos(1 - 2 * i / CORNERS), np.pi * (1 + 5**0.5) * i
+    directions = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], 1)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.maximum(np.ptp(points, axis=0), 1e-9)
+    return np.unique(np.concatenate([(points @ d.T).argmax(0) for d in (directions, corners, np.eye(3), -np.eye(3))]))
+
+
+def spread(vertices: np.ndarray, count: int = POINTS) -> tuple[np.ndarray, float]:
+    """About ``count`` of the vertices, evenly over the surface, and their spacing: one vertex in each cell of a grid."""
+    from scipy.spatial import cKDTree
+
+    lo, size = vertices.min(0), float(np.ptp(vertices, axis=0).max())
+    cell = size / 400
+    while True:
+        key = np.floor((vertices - lo) / max(cell, 1e-12)).astype(np.int64)
+        first = np.unique(key, axis=0, return_index=True)[1]
+        if len(first) <= count or cell > size:
+            points = vertices[np.sort(first)]
+            gaps = cKDTree(points).query(points, k=2)[0][:, 1] if len(points) > 1 else np.zeros(1)
+            return points, max(cell, float(np.quantile(gaps, 0.9)))
+        cell *= 1.25
+
+
+def decompose(vertices: np.ndarray, max_pieces: int = 20, waste: float = 0.002, min_thickness: Optional[float] = None) -> list[Piece]:
+    """Convex pieces that together cover the surface's vertices [N, 3].
+
+    waste: pieces merge while that encloses no more than this fraction of the cube of the size; beyond that only to get down to
+    ``max_pieces``.  min_thickness: of a piece, default 1 % of the size.
+    """
+    from scipy.spatial import ConvexHull
+
+    if len(vertices) < 4:
+        return []
+    points, spacing = spread(vertices)
+    thick = 0.01 * float(np.ptp(points, axis=0).max()) if min_thickness is None else min_thickness
+    allowed = waste * float(np.ptp(points, axis=0).max()) ** 3
+    keys, cells = cells_of(points, spacing)
+    corners = {i: hull(c, thick).vertices for i, c in enumerate(cells)}
+    volumes = {i: ConvexHull(c).volume for i, c in corners.items()}
+    apart = np.abs(keys[:, None] - keys[None]).sum(-1) == 1  # cells that share a face
+    near = {i: set(np.nonzero(apart[i])[0].tolist()) for i in corners}
+
+    def joined(i: int, j: int) -> tuple[float, float]:
+        volume = ConvexHull(np.concatenate([corners[i], corners[j]])).volume
+        return volume - volumes[i] - volumes[j], volume
+
+    costs = {(i, j): joined(i, j) for i in corners for j in near[i] if i < j}
+    new = len(corners)
+    while costs:
+        (i, j), (cost, volume) = min(costs.items(), key=lambda item: item[1][0])
+        if cost > allowed and len(corners) <= max_pieces:
+            break
+        around = (near.pop(i) | near.pop(j)) - {i, j}
+        costs = {pair: c for pair, c in costs.items() if i not in pair and j not in pair}
+        both = np.concatenate([corners.pop(i), corners.pop(j)])
+        corners[new], volumes[new], near[new] = both[ConvexHull(both).vertices], volume, around
+        for k in around:
+            near[k] = (near[k] - {i, j}) | {new}
+            costs[(k, new)] = joined(k, new)
+        new += 1
+    return [hull(c, thick) for c in corners.values()]
+
+
+def cells_of(points: np.ndarray, spacing: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The points by cubic cell: keys [C, 3] and the points of each. A point near a wall is in both cells, so that no gap is left."""
+    size = float(np.ptp(points, axis=0).max()) / CELLS * 1.0001
+    lo = (points.min(0) + points.max(0)) / 2 - size * np.ceil(np.ptp(points, axis=0) / size) / 2
+    shifts = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.6 * spacing
+    limit = np.maximum(np.ceil(np.ptp(points, axis=0) / size).astype(int) - 1, 0)
+    keys = np.floor((points[None] + shifts[:, None] - lo) / size).astype(int).clip(0, limit)
+    rows = np.c_[keys.reshape(-1, 3), np.tile(np.arange(len(points)), len(shifts))]
+    rows = np.unique(rows, axis=0)
+    starts = np.r_[0, np.nonzero((np.diff(rows[:, :3], axis=0) != 0).any(1))[0] + 1, len(rows)]
+    groups = [rows[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True) if b - a >= 4]
+    return np.array([g[0, :3] for g in groups]), [points[g[:, 3]] for g in groups]
+
+
+def intersect(a: Piece, b: Piece, margin: float = 0.0) -> bool:
+    """Whether two pieces share a ball of radius ``margin`` or more (linear programme for the largest ball in both)."""
+    from scipy.optimize import linprog
+
+    if (a.vertices.min(0) > b.vertices.max(0)).any() or (b.vertices.min(0) > a.vertices.max(0)).any():
+        return False
+    n, d = (np.concatenate(x) for x in zip(a.planes(), b.planes(), strict=True))
+    res = linprog([0, 0, 0, -1], A_ub=np.c_[n, np.ones(len(n))], b_ub=d, bounds=[(None, None)] * 3 + [(0, None)], method="highs")
+    return bool(res.status == 0 and res.x[3] > margin)

@@ -1,0 +1,128 @@
+"""GLB (binary glTF 2.0): a node per part with vertex colours, and an animation that opens and shuts every joint.
+
+Written by hand from the Khronos specification (registry.khronos.org/glTF): it is a JSON header and one block of arrays.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from p2gs.export.asset import Asset, Hinge, Link
+
+SECONDS = 4.0  # start -> end -> start
+FLOAT, UINT, UBYTE = 5126, 5125, 5121
+ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
+
+
+class Buffer:
+    """Collects arrays into one block, each with its accessor."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict] = []
+        self.accessors: list[dict] = []
+
+    def add(self, values: np.ndarray, kind: str, component: int, target: int | None = None, normalized: bool = False) -> int:
+        """Index of the new accessor."""
+        self.data += b"\0" * (-len(self.data) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes} | ({"target": target} if target else {})
+        self.data += np.ascontiguousarray(values).tobytes()
+        self.views.append(view)
+        accessor = {"bufferView": len(self.views) - 1, "componentType": component, "count": len(values), "type": kind}
+        if component == FLOAT:
+            rows = values.reshape(len(values), -1)
+            accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+        if normalized:
+            accessor["normalized"] = True
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+
+def write_glb(asset: Asset, out: Path) -> Path:
+    """OUT/twin.glb. A part's node stands at its joint's origin; ``extras`` of the node hold the joint."""
+    path = out / "twin.glb"
+    path.write_bytes(glb_bytes(asset))
+    return path
+
+
+def glb_bytes(asset: Asset) -> bytes:
+    """The file's content."""
+    buffer = Buffer()
+    nodes: list[dict] = [{"name": asset.name, "children": list(range(1, len(asset.links) + 1))}]
+    meshes = []
+    for i, link in enumerate(asset.links):
+        meshes.append(_mesh(buffer, link))
+        nodes.append({"name": link.name, "mesh": i, "translation": link.origin.tolist()} | _extras(link))
+    samplers, channels = [], []
+    times = np.linspace(0, SECONDS, 9, dtype=np.float32)
+    clock = buffer.add(times, "SCALAR", FLOAT) if asset.moving else -1
+    for i, link in enumerate(asset.links):
+        if link.joint is not None:
+            keys, kind, path = _keyframes(link.joint, 1 - np.abs(1 - 2 * times / SECONDS))
+            samplers.append({"input": clock, "output": buffer.add(keys, kind, FLOAT), "interpolation": "LINEAR"})
+            channels.append({"sampler": len(samplers) - 1, "target": {"node": i + 1, "path": path}})
+    material = {"name": "scan", "doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
+    document = {
+        "asset": {"version": "2.0", "generator": "p2gs"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": nodes,
+        "meshes": meshes,
+        "materials": [material],
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.data)}],
+    }
+    if channels:
+        document["animations"] = [{"name": "open_and_shut", "samplers": samplers, "channels": channels}]
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    block = bytes(buffer.data) + b"\0" * (-len(buffer.data) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(block), 0x004E4942) + block
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area-weighted, [V, 3] unit."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normal, face = np.zeros_like(vertices), np.cross(b - a, c - a)
+    for i in range(3):
+        for axis in range(3):
+            normal[:, axis] += np.bincount(faces[:, i], face[:, axis], len(vertices))
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.where(length > 0, normal / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
+
+
+def _mesh(buffer: Buffer, link: Link) -> dict:
+    v = link.visual
+    # glTF takes vertex colours as linear light, pictures are sRGB
+    srgb = v.colours / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    rgba = np.c_[linear, np.ones(len(linear))]
+    attributes = {
+        "POSITION": buffer.add(v.vertices.astype(np.float32), "VEC3", FLOAT, ARRAY_BUFFER),
+        "NORMAL": buffer.add(vertex_normals(v.vertices, v.faces).astype(np.float32), "VEC3", FLOAT, ARRAY_BUFFER),
+        "COLOR_0": buffer.add((rgba * 255).round().astype(np.uint8), "VEC4", UBYTE, ARRAY_BUFFER, normalized=True),
+    }
+    indices = buffer.add(v.faces.astype(np.uint32).reshape(-1), "SCALAR", UINT, ELEMENT_BUFFER)
+    return {"name": link.name, "primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}
+
+
+def _extras(link: Link) -> dict:
+    h = link.joint
+    if h is None:
+        return {}
+    joint = {"type": h.type, "axis": h.axis.tolist(), "origin": h.origin.tolist(), "motion": h.motion, "limits": [h.lower, h.upper]}
+    return {"extras": {"joint": joint}}
+
+
+def _keyframes(hinge: Hinge, shares: np.ndarray) -> tuple[np.ndarray, str, str]:
+    """The node's pose at shares [n] of the motion: quaternions xyzw, or translations."""
+    if hinge.type == "prismatic":
+        return (hinge.origin + shares[:, None] * hinge.motion * hinge.axis).astype(np.float32), "VEC3", "translation"
+    half = shares * hinge.motion / 2
+    return np.c_[np.sin(half)[:, None] * hinge.axis, np.cos(half)].astype(np.float32), "VEC4", "rotation"

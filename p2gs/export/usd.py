@@ -1,0 +1,123 @@
+"""USD as text (.usda): meshes with vertex colours, rigid bodies with mass, and UsdPhysics joints with limits. Needs no library to write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from p2gs.export.asset import Asset, Hinge, Link
+
+
+def write_usd(asset: Asset, out: Path) -> Path:
+    """OUT/twin.usda, metres, up axis Y or Z as asked for."""
+    up = asset.up.upper() if asset.up != "x" else "X"
+    lines = [
+        "#usda 1.0",
+        "(",
+        '    defaultPrim = "twin"',
+        "    metersPerUnit = 1",
+        "    kilogramsPerUnit = 1",
+        f'    upAxis = "{up}"',
+        ")",
+        'def Xform "twin" (prepend apiSchemas = ["PhysicsArticulationRootAPI"])',
+        "{",
+    ]
+    for link in asset.links:
+        lines += _link(link)
+    lines += ['    def PhysicsFixedJoint "fix_base"', "    {", "        rel physics:body1 = </twin/base>", "    }"]
+    for link in asset.moving:
+        lines += _joint(link, asset.links[0].name)
+    path = out / "twin.usda"
+    path.write_text("\n".join([*lines, "}"]) + "\n")
+    return path
+
+
+def _link(link: Link) -> list[str]:
+    values, rotation = principal(link.inertia.matrix)
+    body = [
+        f'    def Xform "{link.name}" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"])',
+        "    {",
+        f"        double3 xformOp:translate = {_tuple(link.origin)}",
+        '        uniform token[] xformOpOrder = ["xformOp:translate"]',
+        f"        float physics:mass = {link.inertia.mass!r}",
+        f"        point3f physics:centerOfMass = {_tuple(link.inertia.center)}",
+        f"        float3 physics:diagonalInertia = {_tuple(values)}",
+        f"        quatf physics:principalAxes = {_tuple(rotation)}",
+    ]
+    visual = link.visual
+    body += _mesh(
+        "visual",
+        visual.vertices,
+        visual.faces,
+        [f"color3f[] primvars:displayColor = {_array(visual.colours / 255, 4)} (", '    interpolation = "vertex"', ")"],
+    )
+    for i, piece in enumerate(link.collision):
+        extra = ['uniform token physics:approximation = "convexHull"', 'uniform token purpose = "guide"']
+        body += _mesh(
+            f"collision_{i}",
+            piece.vertices,
+            piece.faces,
+            extra,
+            ' (prepend apiSchemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"])',
+        )
+    return [*body, "    }"]
+
+
+def _mesh(name: str, vertices: np.ndarray, faces: np.ndarray, extra: list[str], schemas: str = "") -> list[str]:
+    rows = [
+        f"point3f[] points = {_array(vertices, 7)}",
+        f"int[] faceVertexCounts = [{', '.join(['3'] * len(faces))}]",
+        f"int[] faceVertexIndices = [{', '.join(map(str, faces.reshape(-1)))}]",
+        'uniform token subdivisionScheme = "none"',
+        "uniform bool doubleSided = 1",
+        *extra,
+    ]
+    return [f'        def Mesh "{name}"{schemas}', "        {", *("            " + r for r in rows), "        }"]
+
+
+def _joint(link: Link, base: str) -> list[str]:
+    h = link.joint
+    kind = "Revolute" if h.type == "revolute" else "Prismatic"
+    lo, hi = np.degrees([h.lower, h.upper]) if kind == "Revolute" else (h.lower, h.upper)
+    turn = _tuple(x_to(h))
+    return [
+        f'    def Physics{kind}Joint "joint_{link.part}"',
+        "    {",
+        f"        rel physics:body0 = </twin/{base}>",
+        f"        rel physics:body1 = </twin/{link.name}>",
+        '        uniform token physics:axis = "X"',
+        f"        point3f physics:localPos0 = {_tuple(h.origin)}",
+        "        point3f physics:localPos1 = (0, 0, 0)",
+        f"        quatf physics:localRot0 = {turn}",
+        f"        quatf physics:localRot1 = {turn}",
+        f"        float physics:lowerLimit = {float(lo)!r}",
+        f"        float physics:upperLimit = {float(hi)!r}",
+        "    }",
+    ]
+
+
+def x_to(hinge: Hinge) -> np.ndarray:
+    """Quaternion wxyz that turns the x axis into the joint's (USD joints have a coordinate axis and a frame)."""
+    x = hinge.axis
+    w = 1 + x[0]
+    q = np.array([w, 0, -x[2], x[1]]) if w > 1e-9 else np.array([0.0, 0, 0, 1])
+    return q / np.linalg.norm(q)
+
+
+def principal(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Principal moments [3] and the quaternion wxyz of their axes."""
+    from scipy.spatial.transform import Rotation
+
+    values, axes = np.linalg.eigh(matrix)
+    axes = axes * np.sign(np.linalg.det(axes))
+    x, y, z, w = Rotation.from_matrix(axes).as_quat()
+    return values, np.array([w, x, y, z])
+
+
+def _tuple(values) -> str:
+    return "(" + ", ".join(repr(float(v)) for v in values) + ")"
+
+
+def _array(rows: np.ndarray, digits: int) -> str:
+    return "[" + ", ".join("(" + ", ".join(f"{v:.{digits}g}" for v in row) + ")" for row in rows) + "]"
