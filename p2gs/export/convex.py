@@ -36,10 +36,8 @@ class Piece:
         return n, np.einsum("ij,ij->i", n, a)
 
 
-def hull(points: np.ndarray, min_thickness: float) -> Piece:
-    """Convex hull of points [N, 3], made at least ``min_thickness`` thick across its thinnest direction."""
-    from scipy.spatial import ConvexHull
-
+def thickened(points: np.ndarray, min_thickness: float) -> np.ndarray:
+    """Few points [M, 3] whose convex hull is nearly that of the points [N, 3], but at least ``min_thickness`` thick everywhere."""
     center = points.mean(0)
     axes = np.linalg.svd(points - center, full_matrices=False)[2] if len(points) >= 3 else np.eye(3)
     local = (points - center) @ axes.T
@@ -49,15 +47,16 @@ def hull(points: np.ndarray, min_thickness: float) -> Piece:
             shift = np.zeros(3)
             shift[i] = lack / 2
             local = np.concatenate([local - shift, local + shift])
-    local = local[outermost(local)]
-    found = ConvexHull(local, qhull_options="QJ Pp")
-    used, faces = np.unique(found.simplices, return_inverse=True)
-    faces = faces.reshape(-1, 3)
-    vertices = local[used] @ axes + center
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - vertices.mean(0)) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return Piece(vertices, faces.astype(np.int64))
+    return local[outermost(local)] @ axes + center
+
+
+def hull(points: np.ndarray, min_thickness: float) -> Piece:
+    """Convex hull of points [N, 3], made at least ``min_thickness`` thick across its thinnest direction."""
+    import trimesh
+
+    # trimesh sorts out what qhull leaves: merged facets, slivers without a clear side
+    mesh = trimesh.convex.convex_hull(thickened(points, min_thickness))
+    return Piece(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))
 
 
 def outermost(points: np.ndarray) -> np.ndarray:
@@ -99,7 +98,7 @@ def decompose(vertices: np.ndarray, max_pieces: int = 20, waste: float = 0.002, 
     thick = 0.01 * float(np.ptp(points, axis=0).max()) if min_thickness is None else min_thickness
     allowed = waste * float(np.ptp(points, axis=0).max()) ** 3
     keys, cells = cells_of(points, spacing)
-    corners = {i: hull(c, thick).vertices for i, c in enumerate(cells)}
+    corners = {i: thickened(c, thick) for i, c in enumerate(cells)}
     volumes = {i: ConvexHull(c).volume for i, c in corners.items()}
     apart = np.abs(keys[:, None] - keys[None]).sum(-1) == 1  # cells that share a face
     near = {i: set(np.nonzero(apart[i])[0].tolist()) for i in corners}
