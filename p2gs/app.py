@@ -8,7 +8,7 @@ import os
 import sys
 from typing import NoReturn
 
-COMMANDS = ("fit", "test", "predict", "export", "view", "data", "bench", "version")
+COMMANDS = ("fit", "test", "predict", "export", "view", "data", "bench", "table", "version")
 
 FIT_HELP = """\
 Any option of the config can follow as --key.of.it VALUE; null switches a loss or callback off:
@@ -17,6 +17,11 @@ Any option of the config can follow as --key.of.it VALUE; null switches a loss o
   --phases.articulation.losses.part.weight 0.3  --callbacks.previews.every 500
 
 --print_config shows every option with its value. A run that was interrupted goes on when the same command is given again.
+"""
+
+BENCH_HELP = """\
+Options of the runs follow as --key.of.it VALUE and go to every fit: --phases.single_state.steps 500. A bench that was stopped goes on
+when the same command is given again; runs that have their scores are not run again. p2gs table makes the tables.
 """
 
 
@@ -96,10 +101,29 @@ def parser(prog: str = "p2gs") -> Parser:
     synth.add_argument("--format", choices=("artgs", "dta", "paris"), default="artgs", help="layout (default artgs)")
     synth.add_argument("--no_depth", action="store_true", help="write no depth maps")
 
-    bench = add("bench", "measure")
-    what = bench.add_subparsers(dest="action", metavar="WHAT", required=True)
+    ready = actions.add_parser("prepare", help="check a downloaded benchmark", description="Check a downloaded benchmark against the object lists.")
+    ready.add_argument("root", metavar="DIR", help="the downloaded tree")
+    ready.add_argument("--objects", nargs="+", default=["all"], metavar="NAME", help="paris, dta_multi, artgs_multi or object ids (default all)")
+
+    bench = add("bench", "run objects x settings x seeds, or time the rasterizers", epilog=BENCH_HELP)
+    bench.add_argument("-c", "--config", **several, metavar="FILE", help="YAML files of benches (bench/paris.yaml), later ones laid on earlier ones")
+    bench.add_argument("--root", metavar="DIR", help="the tree that holds the objects")
+    bench.add_argument("--out", metavar="DIR", help="result folder (default runs/bench/<name>)")
+    for name, text in (("objects", "only these objects"), ("settings", "only these settings")):
+        bench.add_argument(f"--{name}", nargs="+", metavar="NAME", help=text)
+    bench.add_argument("--seeds", nargs="+", metavar="N", help="default 0 1 2")
+    bench.add_argument("--executor", metavar="local|slurm|ray", help="where the runs are carried out (default local)")
+    bench.add_argument("--processes", metavar="N", help="runs at once, for local (default 1)")
+    bench.add_argument("--dry_run", action="store_true", help="print the runs and their commands and stop")
+    bench.add_argument("--skip_failed", action="store_true", help="do not try again what failed before")
+    what = bench.add_subparsers(dest="action", metavar="[kernels]")
     kernels = what.add_parser("kernels", help="time the rasterizers", description="Time the rasterizers.", add_help=False)
     kernels.add_argument("words", nargs=argparse.REMAINDER)
+
+    table = add("table", "put a bench's results beside the paper's: Markdown, LaTeX, CSV, plots")
+    table.add_argument("bench", metavar="BENCH_DIR", help="result folder of a bench")
+    table.add_argument("--tables", nargs="+", metavar="NAME", help="tables of the paper to fill (default: those that the bench names)")
+    table.add_argument("--out", metavar="DIR", help="folder for the tables (default BENCH_DIR/tables)")
 
     add("version", "print the version")
     return top
@@ -113,7 +137,7 @@ def run(words: list[str], prog: str = "p2gs") -> int:
         if args.command is None:
             top.print_help()
             return 0
-        if rest and args.command != "fit":
+        if rest and args.command not in ("fit", "bench"):
             command = f"{prog} {args.command}"
             raise UsageError(f"'{rest[0]}' is no option of {command}{_similar(rest[0], top, args)} (see {command} --help)")
         return _carry_out(args, rest)
@@ -150,10 +174,10 @@ def _carry_out(args: argparse.Namespace, rest: list[str]) -> int:
             from p2gs.commands.data import data
 
             return data(args)
-        if args.command == "bench":
-            from p2gs.bench.kernels import main
+        if args.command in ("bench", "table"):
+            from p2gs.commands import bench
 
-            return main(args.words)
+            return bench.bench(args, rest) if args.command == "bench" else bench.table(args)
         from p2gs.commands import runs
 
         return getattr(runs, args.command)(args)
@@ -167,7 +191,7 @@ def _fail(message: str) -> int:
 
 
 def _interrupted(prog: str, words: list[str]) -> int:
-    go_on = "; give the same command again to go on where it stopped" if words[:1] == ["fit"] else ""
+    go_on = "; give the same command again to go on where it stopped" if words[:1] in (["fit"], ["bench"]) else ""
     print(f"\nstopped{go_on}", file=sys.stderr)
     return 130
 

@@ -1,4 +1,4 @@
-"""The commands on scene folders: ``p2gs data check`` and ``p2gs data synth``. Each takes the parsed arguments, returns the exit code."""
+"""The commands on scene folders: ``p2gs data check``, ``synth`` and ``prepare``. Each takes the parsed arguments, returns the exit code."""
 
 from __future__ import annotations
 
@@ -9,7 +9,17 @@ from p2gs.types import UserError
 
 
 def data(args: argparse.Namespace) -> int:
-    return check(args) if args.action == "check" else synth(args)
+    return {"check": check, "synth": synth, "prepare": prepare}[args.action](args)
+
+
+def prepare(args: argparse.Namespace) -> int:
+    """What a downloaded tree has of the benchmarks; 2 where an object is missing or incomplete."""
+    from p2gs.data.prepare import prepare, prepare_lines
+
+    found = prepare(args.root, args.objects)
+    for line in prepare_lines(found):
+        print(line)
+    return 0 if all(p.ready for p in found) else 2
 
 
 def check(args: argparse.Namespace) -> int:

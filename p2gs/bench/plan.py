@@ -1,0 +1,341 @@
+"""What a bench runs: objects x settings x seeds, read from a YAML file such as ``configs/bench/paris.yaml``.
+
+    name: paris                        # result folder runs/bench/<name> unless out says otherwise
+    tables: [main_result]              # tables of the paper to fill (names of p2gs/bench/data/published/*.csv)
+    root: data                         # the tree that holds the objects' folders; --root DIR
+    objects: [paris]                   # benchmarks or object ids; null: every scene folder below root
+    config: [preset/cpu.yaml]          # laid under every run
+    settings:                          # name -> what it changes
+      full: {}
+      no_repel: {config: [ablation/no_repel.yaml]}
+      k_plus_2: {num_parts: gt+2}      # relative to the object's true number of parts
+    seeds: [0, 1, 2]
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Iterable, Iterator, Literal, Optional, Union
+
+from p2gs.config_files import Layer, overrides_layer, parse_overrides, read_config
+from p2gs.registry import suggest
+from p2gs.schema import Leaf, Plain, Section, build, check_keys, complete, merge, section_of
+from p2gs.types import UserError
+
+GT = re.compile(r"gt\s*(?:([+-])\s*(\d+))?")
+
+
+@dataclass
+class Setting:
+    """One row of a matrix. config: files laid on the bench's.  set: single options, ``{phases.articulation.steps: 500}``.
+    num_parts: a number, auto, or gt, gt+2, gt-1 (relative to the true number, static base counted); null: as the config says.
+    """
+
+    config: list[str] = field(default_factory=list)
+    set: dict[str, Any] = field(default_factory=dict)
+    num_parts: Optional[Union[int, str]] = None
+
+
+@dataclass
+class SlurmOptions:
+    """For executor: slurm. cluster: slurm, or submitit's local and debug executors.  jobs: at most so many at once (job array).
+    extra: further options of submitit, such as {slurm_partition: gpu, slurm_account: me}.
+    """
+
+    cluster: Literal["slurm", "local", "debug"] = "slurm"
+    minutes: int = 120
+    cpus: int = 8
+    memory_gb: float = 16
+    gpus: int = 0
+    jobs: int = 16
+    extra: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class RayOptions:
+    """For executor: ray. address: of a running cluster, or null to start one on this machine.  cpus, gpus: of one run."""
+
+    address: Optional[str] = None
+    cpus: float = 2
+    gpus: float = 0
+
+
+@dataclass
+class BenchOptions:
+    """Options of a bench beside its settings; see the module. export: formats written between fit and test (meshes are scored).
+
+    reuse: a run takes over finished stages of the same object and seed from the settings before it; stages whose config differs are
+    run again, so the results are those of independent runs.  processes: runs at once (local).  threads: of one run, default the
+    cores divided by the processes.  timeout_minutes: a longer run is stopped and counts as failed.
+    """
+
+    name: str = "bench"
+    tables: list[str] = field(default_factory=list)
+    out: Optional[str] = None
+    root: str = "."
+    objects: Optional[list[str]] = None
+    config: list[str] = field(default_factory=lambda: ["preset/cpu.yaml"])
+    set: dict[str, Any] = field(default_factory=dict)
+    seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
+    export: list[str] = field(default_factory=lambda: ["ply"])
+    reuse: bool = True
+    executor: Literal["local", "slurm", "ray"] = "local"
+    processes: int = 1
+    threads: Optional[int] = None
+    timeout_minutes: Optional[float] = None
+    slurm: SlurmOptions = field(default_factory=SlurmOptions)
+    ray: RayOptions = field(default_factory=RayOptions)
+
+    def __post_init__(self):
+        for name in ("processes", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise UserError(f"{name}: expected at least 1, got {value}")
+        if not self.seeds:
+            raise UserError("seeds: expected at least one")
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.out) if self.out else Path("runs") / "bench" / self.name
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One object of a bench: its name in the tables, where it lies, its true number of parts (None: not known)."""
+
+    name: str
+    column: str
+    root: str
+    format: Optional[str] = None
+    source: Optional[str] = None
+    parts: Optional[int] = None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run. words: of ``p2gs fit`` without ``--run``.  key: changes with all that decides the result.  donors: run folders that may
+    hold finished stages of the same object and seed.
+    """
+
+    object: str
+    setting: str
+    seed: int
+    run: str
+    words: tuple[str, ...]
+    key: str
+    parts: Optional[int] = None
+    export: tuple[str, ...] = ()
+    donors: tuple[str, ...] = ()
+    threads: Optional[int] = None
+    timeout_minutes: Optional[float] = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.object} {self.setting} seed {self.seed}"
+
+
+class Bench:
+    """A bench that was read and checked. Attributes: ``options``, ``settings`` by name, ``scenes``, ``cells``."""
+
+    def __init__(self, options: BenchOptions, settings: dict[str, Setting], tree: Plain):
+        self.options, self.settings, self.tree = options, settings, tree
+        self.scenes = list(find_scenes(options))
+        if not self.scenes:
+            raise UserError(f"{options.root}: holds no scene of a known layout")
+        self.cells = list(self._expand())
+
+    def _expand(self) -> Iterator[Cell]:
+        """Setting by setting: the first ones make the stages that later ones take over."""
+        o = self.options
+        donors: dict[tuple[str, int], list[str]] = {}
+        for name, setting in self.settings.items():
+            merged = self._merged(setting)
+            for scene in self.scenes:
+                parts = resolve_parts(setting.num_parts, scene)
+                for seed in o.seeds:
+                    decides = [merged, o.set, setting.set, parts, scene.name, scene.format, scene.source, seed, o.export]
+                    key = hashlib.sha256(json.dumps(decides, sort_keys=True, default=str).encode()).hexdigest()[:16]
+                    run = str(o.folder / "runs" / name / scene.name / f"seed{seed}")
+                    before = donors.setdefault((scene.name, seed), [])
+                    yield Cell(
+                        object=scene.name,
+                        setting=name,
+                        seed=seed,
+                        run=run,
+                        words=self.words(setting, scene, seed),
+                        key=key,
+                        parts=scene.parts,
+                        export=tuple(o.export),
+                        donors=tuple(before) if o.reuse else (),
+                        threads=o.threads,
+                        timeout_minutes=o.timeout_minutes,
+                    )
+                    before.append(run)
+
+    def _merged(self, setting: Setting) -> Plain:
+        """The config files' content: a changed file is another result."""
+        tree: Plain = {}
+        for name in self.files(setting):
+            for layer in read_config(name):
+                tree = merge(tree, layer.tree)
+        return tree
+
+    def files(self, setting: Setting) -> list[str]:
+        return [*self.options.config, *setting.config]
+
+    def words(self, setting: Setting, scene: Scene, seed: int) -> tuple[str, ...]:
+        """The words of ``p2gs fit``."""
+        return (*(word for name in self.files(setting) for word in ("-c", name)), *self.overrides(setting, scene, seed))
+
+    def overrides(self, setting: Setting, scene: Scene, seed: int) -> list[str]:
+        words = ["--data.root", scene.root]
+        if scene.format is not None:
+            words += ["--data.format", scene.format]
+        if scene.source is not None:
+            words += ["--data.source", scene.source]
+        words += ["--seed", str(seed)]
+        parts = resolve_parts(setting.num_parts, scene)
+        if parts is not None:
+            words += ["--num_parts", parts]
+        for key, value in {**self.options.set, **setting.set}.items():
+            words += [f"--{key}", value if isinstance(value, str) else json.dumps(value)]
+        return words
+
+    def check_settings(self) -> None:
+        """Build every setting's config once, so that a mistake is told before anything runs. Raises UserError."""
+        from p2gs.config import load_config
+
+        for name, setting in self.settings.items():
+            try:
+                load_config(self.files(setting), self.overrides(setting, self.scenes[0], self.options.seeds[0]))
+            except UserError as err:
+                raise UserError(f"settings.{name}: {err}") from err
+
+
+def resolve_parts(wanted: Optional[Union[int, str]], scene: Scene) -> Optional[str]:
+    """``gt+2`` -> "6" for an object of four parts; never below 2. Raises UserError where the truth is not known or the text means nothing."""
+    if wanted is None or wanted == "auto" or isinstance(wanted, int) or str(wanted).isdigit():
+        return None if wanted is None else str(wanted)
+    match = GT.fullmatch(str(wanted).strip().lower())
+    if match is None:
+        raise UserError(f"num_parts: expected a number, auto, gt or gt+N, got '{wanted}'")
+    if scene.parts is None:
+        raise UserError(f"num_parts: {wanted} needs the true number of parts of {scene.name}, which has no ground truth")
+    sign, number = match.groups()
+    return str(max(scene.parts + (int(number) if number else 0) * (-1 if sign == "-" else 1), 2))
+
+
+def find_scenes(options: BenchOptions) -> Iterator[Scene]:
+    """The objects of a bench. Raises UserError where a listed one is not in the tree."""
+    from p2gs.data.objects import find_objects, pick_objects
+
+    root = Path(options.root)
+    if not root.is_dir():
+        raise UserError(f"root: there is no folder {root} (--root DIR names the tree that holds the objects)")
+    if options.objects is None:
+        yield from local_scenes(root)
+        return
+    objects = pick_objects(options.objects)
+    places = find_objects(root, objects)
+    missing = [o.id for o in objects if o.id not in places]
+    if missing:
+        raise UserError(f"{root}: lacks {', '.join(missing)} (p2gs data prepare {root} says more; --objects names fewer)")
+    for o in objects:
+        where = places[o.id]
+        yield Scene(o.id, o.column, str(where.root), where.format, where.source, o.parts)
+
+
+def local_scenes(root: Path) -> Iterator[Scene]:
+    """Every scene folder below ``root``, named by its folder (by its path where two folders have one name)."""
+    from p2gs.data.ground_truth import load_ground_truth
+    from p2gs.data.layouts import detect_format
+    from p2gs.data.objects import scene_folders
+
+    folders = scene_folders(root)
+    names = [f.resolve().name for f in folders]
+    for folder, name in zip(folders, names, strict=True):
+        if names.count(name) > 1:
+            name = "_".join(folder.relative_to(root).parts)
+        format = detect_format(folder)
+        truth = load_ground_truth(folder, format)
+        yield Scene(name, name, str(folder), format, None, None if truth is None else len(truth.joints) + 1)
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------------------
+
+
+def read_bench(
+    files: Iterable[str],
+    words: Iterable[str] = (),
+    objects: Optional[list[str]] = None,
+    settings: Optional[list[str]] = None,
+) -> Bench:
+    """The bench of YAML files (merged in order, ``include`` works).
+
+    words: overrides as on the command line; those that name no option of a bench (``--phases.articulation.steps 100``) go to every fit.
+    objects, settings: of those in the files, run these only. Raises UserError.
+    """
+    schema = section_of(BenchOptions)
+    own, for_fit = [], {}
+    for key, value in parse_overrides(list(words)):
+        if key.split(".")[0] in (*schema.children, "settings"):
+            own.append((key, value))
+        else:
+            for_fit[key] = value
+    layers = [layer for name in files for layer in read_config(name)]
+    layers += [overrides_layer(own), Layer({"set": for_fit})]
+    tree: Plain = {}
+    for layer in layers:
+        tree = merge(tree, _checked(layer.tree, schema, layer.where))
+    given = {name: value for name, value in (tree.pop("settings", None) or {"full": {}}).items() if value is not None}
+    given = {name: given[name] for name in only(settings, given, "settings")}
+    if objects:
+        tree["objects"] = _narrowed(tree.get("objects"), objects)
+    options: BenchOptions = build(complete(tree, schema), schema)
+    one = section_of(Setting)
+    built = {name: build(complete(v, one, f"settings.{name}."), one) for name, v in given.items()}
+    bench = Bench(options, built, {**tree, "settings": given})
+    if objects and options.objects is None:
+        bench.scenes = [s for s in bench.scenes if s.name in only(objects, [s.name for s in bench.scenes], "objects")]
+        bench.cells = list(bench._expand())
+    return bench
+
+
+def _narrowed(listed: Optional[list[str]], wanted: list[str]) -> Optional[list[str]]:
+    """The wanted ones of the listed benchmark objects; None (every folder) stays."""
+    from p2gs.data.objects import pick_objects
+
+    if listed is None:
+        return None
+    return only([o.id for o in pick_objects(wanted)], [o.id for o in pick_objects(listed)], "objects")
+
+
+def _checked(tree: Plain, schema: Section, where: str) -> Plain:
+    """The tree, after its keys were found to exist; ``null`` for a setting removes it."""
+    settings = tree.get("settings") or {}
+    if not isinstance(settings, dict):
+        raise UserError(f"{where}settings: expected name: {{config: [...]}}, got {settings!r}")
+    rest = {k: v for k, v in tree.items() if k != "settings"}
+    check_keys(rest, Section(dict, {**schema.children, "settings": Leaf(dict, {})}), where)
+    one = section_of(Setting)
+    for name, value in settings.items():
+        if not re.fullmatch(r"[\w.+-]+", str(name)):
+            raise UserError(f"{where}settings: '{name}' names a folder, so letters, digits and ._+- only")
+        if value is not None:
+            if not isinstance(value, dict):
+                raise UserError(f"{where}settings.{name}: expected options (key: value), got {value!r}")
+            check_keys(value, one, f"{where}settings.{name}: ")
+    return tree
+
+
+def only(names: Optional[list[str]], known: Iterable[str], what: str) -> list[str]:
+    """``names`` in the order of ``known``; all where none is given. Raises UserError for an unknown one."""
+    known = list(known)
+    for name in names or ():
+        if name not in known:
+            raise UserError(f"--{what}: there is no '{name}'{suggest(name, known)}")
+    return [name for name in known if not names or name in names]

@@ -1,0 +1,99 @@
+"""Runs a bench: hands over what is not done, notes what failed, shows where it stands."""
+
+from __future__ import annotations
+
+import functools
+import json
+import signal
+import threading
+import time
+from collections import Counter
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Iterator, Optional, Sequence
+
+from p2gs.bench.cell import PROGRAM, Outcome, note, run_cell, status
+from p2gs.bench.executors import executor
+from p2gs.bench.live import Display
+from p2gs.bench.plan import Bench, Cell
+from p2gs.config_files import provenance, to_yaml
+
+POLL = 0.2  # seconds between two looks at the jobs
+
+
+def run_bench(bench: Bench, *, skip_failed: bool = False, program: Sequence[str] = PROGRAM, display: Optional[Display] = None) -> Counter:
+    """Carry out every run that is not done. Returns how many there are by status (done, failed).
+
+    skip_failed: leave runs alone that failed before; otherwise they are tried again.  program: the words before ``fit ...``.
+    """
+    folder = bench.options.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    save_bench(bench)
+    known = {cell.name: status(cell) for cell in bench.cells}
+    left_out = ("done", "failed") if skip_failed else ("done",)
+    waiting = [cell for cell in bench.cells if known[cell.name] not in left_out]
+    known |= {cell.name: "todo" for cell in waiting}
+    show = display or Display(bench)
+    with interruptible():
+        jobs: dict[str, tuple[Cell, object]] = {}
+        place = executor(bench.options, functools.partial(run_cell, program=tuple(program))) if waiting else None
+        stop = True
+        try:
+            with show.on(known, place.slots if place else 1):
+                while waiting or jobs:
+                    while waiting and len(jobs) < place.slots:
+                        cell = waiting.pop(0)
+                        jobs[cell.name] = cell, place.start(cell)
+                        known[cell.name] = "running"
+                        show.started(cell)
+                    for name, (cell, job) in list(jobs.items()):
+                        if job.done():
+                            del jobs[name]
+                            outcome = result(cell, job)
+                            known[name] = outcome.status
+                            show.ended(cell, outcome)
+                    show.refresh()
+                    time.sleep(POLL if jobs else 0)
+            stop = False
+        finally:
+            if place is not None:
+                place.close(stop)
+    return Counter(known.values())
+
+
+def result(cell: Cell, job) -> Outcome:
+    """What became of a job; a failure of the machinery (a lost node) is the run's failure, noted in its folder."""
+    try:
+        return job.result()
+    except Exception as err:
+        text = " ".join(str(err).split()) or type(err).__name__
+        Path(cell.run).mkdir(parents=True, exist_ok=True)
+        note(cell, status="failed", seconds=0.0, error=text[-300:])
+        return Outcome("failed", 0.0, text[-300:])
+
+
+def save_bench(bench: Bench) -> None:
+    """OUT/bench.yaml, which runs the same bench again, and OUT/cells.json, which ``p2gs table`` reads."""
+    folder = bench.options.folder
+    (folder / "bench.yaml").write_text(to_yaml({**bench.tree, "out": str(folder)}), encoding="utf-8")
+    cells = [{"object": c.object, "setting": c.setting, "seed": c.seed, "run": str(Path(c.run).relative_to(folder))} for c in bench.cells]
+    scenes = [{"name": s.name, "column": s.column, "parts": s.parts} for s in bench.scenes]
+    about = {"p2gs": provenance(), "name": bench.options.name, "tables": bench.options.tables, "scenes": scenes, "cells": cells}
+    (folder / "cells.json").write_text(json.dumps(about, indent=1) + "\n")
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """A termination signal stops the bench as Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number, frame):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
