@@ -92,11 +92,20 @@ class Asset:
         return [link for link in self.links if link.joint is not None]
 
 
-def load_asset(run_dir: Path | str, scale: float = 1.0, up: str = "z", origin: str = "keep", density: float = DENSITY) -> Asset:
+def load_asset(
+    run_dir: Path | str,
+    scale: float = 1.0,
+    up: str = "z",
+    origin: str = "keep",
+    density: float = DENSITY,
+    max_faces: int = MAX_FACES,
+    solid: bool = True,
+) -> Asset:
     """Read a run (its meshes are made if they are not there) into the target's conventions.
 
     scale: metres per input unit.  up: axis of the target that points up; the input's is z.  origin: ``keep`` the input's,
-    ``center`` of the object's box, or the middle of its ``bottom``.  Raises UserError for other values or a run without a twin.
+    ``center`` of the object's box, or the middle of its ``bottom``.  solid: with collision pieces and inertia; without, for looking
+    at only, it takes no time.  Raises UserError for other values or a run without a twin.
     """
     if up not in UPS:
         raise UserError(f"--up is '{up}', expected one of {', '.join(UPS)}")
@@ -114,8 +123,8 @@ def load_asset(run_dir: Path | str, scale: float = 1.0, up: str = "z", origin: s
     pairs = [(p, m) for p, m in zip(obj.parts, meshes, strict=True) if len(m.faces)]
     if not pairs or pairs[0][0].joint is not None:
         raise UserError(f"{run_dir}: the static part has no surface, so there is no base to hang joints on")
-    links = [make_link(part.id, part.joint, mesh, place, density) for part, mesh in pairs]
-    return Asset(run_dir.resolve().name, links, up, overlapping_pairs(links))
+    links = [make_link(part.id, part.joint, mesh, place, density, max_faces, solid) for part, mesh in pairs]
+    return Asset(run_dir.resolve().name, links, up, overlapping_pairs(links) if solid else [])
 
 
 def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placement:
@@ -127,13 +136,13 @@ def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placeme
     return Placement(float(scale), turns[up], where[origin])
 
 
-def make_link(part: int, joint: Optional[Joint], mesh: Mesh, place: Placement, density: float) -> Link:
+def make_link(part: int, joint: Optional[Joint], mesh: Mesh, place: Placement, density: float, max_faces: int, solid: bool) -> Link:
     """One part with its collision pieces, inertia and joint."""
     at = np.zeros(3) if joint is None else place.points(joint.origin.numpy())
-    world = simplify(mesh, MAX_FACES)
+    world = simplify(mesh, max_faces)
     visual = Mesh(place.points(world.vertices) - at, world.faces, world.colours)
-    pieces = decompose(place.points(mesh.vertices) - at)
-    inertia = inertia_of(pieces, density)
+    pieces = decompose(place.points(mesh.vertices) - at) if solid else []
+    inertia = inertia_of(pieces, density) if solid else Inertia(0.0, np.zeros(3), np.zeros((3, 3)))
     hinge = None
     if joint is not None:
         axis = place.vector(joint.axis.numpy())

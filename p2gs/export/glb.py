@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from p2gs.export.asset import Asset, Hinge, Link
+from p2gs.ops.palette import part_colour
 
 SECONDS = 4.0  # start -> end -> start
 FLOAT, UINT, UBYTE = 5126, 5125, 5121
@@ -113,11 +114,11 @@ def _mesh(buffer: Buffer, link: Link) -> dict:
 
 
 def _extras(link: Link) -> dict:
-    h = link.joint
+    h, colour = link.joint, list(part_colour(link.part))
     if h is None:
-        return {}
+        return {"extras": {"colour": colour}}
     joint = {"type": h.type, "axis": h.axis.tolist(), "origin": h.origin.tolist(), "motion": h.motion, "limits": [h.lower, h.upper]}
-    return {"extras": {"joint": joint}}
+    return {"extras": {"colour": colour, "joint": joint}}
 
 
 def _keyframes(hinge: Hinge, shares: np.ndarray) -> tuple[np.ndarray, str, str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
+from typing import Sequence
 
 from p2gs.export.frame import gaussians_to_input, object_to_input
 from p2gs.export.media import scene_photos, write_media
@@ -29,3 +31,23 @@ def write_twin(obj: ArticulatedObject, run_dir: Path | str, scene: TwoStateScene
     if media:
         write_media(outer, run_dir / "media", [c.camera for c in cameras], scene_photos(scene, outer))
     write_twin_json(obj, run_dir / "twin.json")
+
+
+def complete_run(run_dir: Path | str, formats: Sequence[str] = ("urdf", "mjcf", "glb"), log=print) -> None:
+    """The rest of the result folder: meshes, simulator files and report.html, from what ``write_twin`` left (no dataset needed).
+
+    log: told one line a step with its seconds.
+    """
+    from p2gs.export.formats import export_run
+    from p2gs.export.mesh import write_meshes
+    from p2gs.export.report import write_report
+
+    run_dir = Path(run_dir)
+    for name, step in (
+        ("meshes", lambda: write_meshes(run_dir)),
+        ("exports", lambda: export_run(run_dir, formats)),
+        ("report", lambda: write_report(run_dir)),
+    ):
+        began = time.perf_counter()
+        step()
+        log(f"{name}: {time.perf_counter() - began:.1f} s")
