@@ -11,6 +11,7 @@ import hashlib
 import json
 import resource
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Optional
 
@@ -107,16 +108,16 @@ class Pipeline:
     def run(self, only: Optional[str] = None) -> Path:
         self.run_dir.mkdir(parents=True, exist_ok=True)
         save_config(self.cfg, self.run_dir / "config.yaml")
-        states = [self.stage(f"single_state_{s}", only, lambda s=s: self.train(f"single_state_{s}", "single_state", lambda c: self.single_state(s, c))) for s in (0, 1)]
+        states = [self.stage(f"single_state_{s}", only, partial(self.train, f"single_state_{s}", partial(self.single_state, s))) for s in (0, 1)]
         if only == "single_state":
             return self.run_dir
         motions = self.stage("discovery", only, lambda: self.discover(states)) if self.init == "discovery" else None
         if only == "discovery":
             return self.run_dir
-        canonical = self.stage("canonical_fusion", only, lambda: self.train("canonical_fusion", "canonical_fusion", lambda c: self.fusion(states, motions, c)))
+        canonical = self.stage("canonical_fusion", only, partial(self.train, "canonical_fusion", partial(self.fusion, states, motions)))
         if only == "canonical_fusion":
             return self.run_dir
-        learned = self.stage("articulation", only, lambda: self.train("articulation", "articulation", lambda c: self.articulate(canonical, states, motions, c)))
+        learned = self.stage("articulation", only, partial(self.train, "articulation", partial(self.articulate, canonical, states, motions)))
         if only == "articulation":
             return self.run_dir
         self.stage("finish", only, lambda: self.write(learned, states))
@@ -177,12 +178,12 @@ class Pipeline:
         parts = len(motions) + 1 if motions is not None else self.cfg.num_parts
         return ArticulationPhase(section.config, section.losses, canonical, states, motions, parts, extent, self.views, **self.common())
 
-    def train(self, stage: str, phase_name: str, build: Callable[[Any], Phase]) -> Any:
+    def train(self, stage: str, build: Callable[[Any], Phase]) -> Any:
         """One training phase with a Trainer of its own."""
         from lightning.pytorch import Trainer, seed_everything
         from lightning.pytorch.loggers import TensorBoardLogger
 
-        section = self.cfg.phases[phase_name]
+        section = self.cfg.phases[next(n for n in STAGES if stage.startswith(n))]
         seed_everything(self.cfg.seed, verbose=False)
         phase = build(section)
         phase.phase_name = stage
@@ -199,7 +200,7 @@ class Pipeline:
             max_epochs=-1,
             accelerator="gpu" if self.device.type == "cuda" else "cpu",
             devices=1,
-            logger=TensorBoardLogger(self.run_dir / "logs", name=stage, version=""),
+            logger=TensorBoardLogger(self.run_dir / "logs", name=stage, version="", default_hp_metric=False),
             callbacks=[callbacks[n] for n in order],
             default_root_dir=self.run_dir,
             enable_progress_bar=False,

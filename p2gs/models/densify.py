@@ -20,7 +20,7 @@ def densify(
     split_scale: float = 0.01,
     max_growth: float = 0.15,
 ) -> tuple[int, int]:
-    """Prune faint or huge Gaussians, then grow towards ``target`` by copying those with the largest mean screen gradient.
+    """Prune Gaussians that are faint, huge or in no view since the last call, then grow towards ``target`` by copying those with the largest mean screen gradient.
 
     Gaussians larger than ``split_scale`` (internal units, largest axis) are split: both copies are shrunk by 1.6 and the
     second is drawn from the first's density; smaller ones are cloned in place with both opacities lowered so that the pair is
@@ -33,7 +33,8 @@ def densify(
         opacity = torch.sigmoid(splats.opacity_logits)
         scale = splats.log_scales.exp().amax(dim=1)
         finite = torch.isfinite(splats.means).all(dim=1) & torch.isfinite(scale)
-        keep = (opacity > min_opacity) & (scale < max_scale) & finite
+        watched = splats.seen > 0 if bool((splats.seen > 0).any()) else torch.ones_like(finite)  # what no view sees is never carved away
+        keep = (opacity > min_opacity) & (scale < max_scale) & finite & watched
         if not keep.any():
             keep = finite  # an object that is not there yet: prune nothing but garbage
         kept = keep.nonzero().squeeze(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from p2gs.data.views import TrainingViews, view_index
 from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.handover import StateGaussians
+from p2gs.models.initial import initial_points, isotropic_gaussians
 from p2gs.models.phase import Phase, PhaseConfig, exponential, register_phase
 from p2gs.models.splats import Splats
 from p2gs.render import rasterize
@@ -27,7 +29,7 @@ class ImageConfig(PhaseConfig):
 
     levels: list[int] = field(default_factory=lambda: [100, 200, 400])
     level_starts: list[float] = field(default_factory=lambda: [0.0, 0.1, 0.35])
-    background: str = "random"
+    background: Literal["random", "white", "black", "grey"] = "random"
 
 
 @dataclass
@@ -63,7 +65,7 @@ class SingleStateConfig(ImageConfig):
     steps: int = 6000
     initial_gaussians: int = 10000
     initial_opacity: float = 0.1
-    init: str = "auto"
+    init: Literal["auto", "random"] = "auto"
     sh_degree: int = 1
     sh_every: int = 500
     rates: SplatRates = field(default_factory=SplatRates)
@@ -152,7 +154,7 @@ class SingleStatePhase(ImagePhase):
         super().__init__(config, losses, {state: views}, **common)
         self.state = state
         self.seed = self.seed * 2 + state
-        points, colours = initial_points(scene, state, config, self.generator(0, 2))
+        points, colours = initial_points(scene, state, config.initial_gaussians, config.init, self.generator(0, 2))
         self.splats = Splats(isotropic_gaussians(points, colours, config.initial_opacity, config.sh_degree))
 
     def parameter_groups(self):
@@ -179,51 +181,3 @@ class SingleStatePhase(ImagePhase):
         out = render_gaussians(self.splats.tensors(), shot.camera, white, backend=self.rasterizer)
         both = torch.cat([shot.image, out.colour], dim=1)
         return {f"state_{self.state}": (both.clamp(0, 1) * 255).to(torch.uint8)}
-
-
-def initial_points(scene: TwoStateScene, state: int, config: SingleStateConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Points [N, 3] and colours [N, 3] to start from: depth points where allowed and present, else random in the box."""
-    n = config.initial_gaussians
-    if config.init == "auto" and scene.has_depth:
-        points, colours = depth_points(scene.select(state=state, split="train"), n, generator)
-        if len(points) > 100:
-            return points, colours
-    low, high = scene.box
-    return low + torch.rand(n, 3, generator=generator) * (high - low), torch.full((n, 3), 0.5)
-
-
-def depth_points(views, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """``count`` pixels with known depth, back-projected: points [N, 3] and colours [N, 3]."""
-    points, colours = [], []
-    per_view = -(-count // max(len(views), 1))
-    for view in views:
-        rows, cols = ((view.depth > 0) & (view.alpha > 250)).nonzero(as_tuple=True)
-        if rows.numel() == 0:
-            continue
-        pick = torch.randint(rows.numel(), (per_view,), generator=generator)
-        rows, cols = rows[pick], cols[pick]
-        pixels = torch.stack([cols + 0.5, rows + 0.5, torch.ones(per_view)], dim=1)
-        rays = pixels @ torch.linalg.inv(view.camera.K).T
-        local = rays * view.depth[rows, cols, None]
-        R, t = view.camera.viewmat[:3, :3], view.camera.viewmat[:3, 3]
-        points.append((local - t) @ R)
-        colours.append(view.image[rows, cols].float() / 255)
-    if not points:
-        return torch.zeros(0, 3), torch.zeros(0, 3)
-    return torch.cat(points)[:count], torch.cat(colours)[:count]
-
-
-def isotropic_gaussians(points: Tensor, colours: Tensor, opacity: float, sh_degree: int) -> GaussianTensors:
-    """Round Gaussians as large as the mean distance to their three nearest neighbours."""
-    from p2gs.ops.knn import knn
-    from p2gs.ops.sh import rgb_to_dc
-
-    n = len(points)
-    distance, _ = knn(points, None, min(3, n - 1), True)
-    log_scales = distance.mean(dim=1).clamp(1e-4, 0.2).log()[:, None].expand(n, 3).contiguous()
-    sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
-    sh[:, 0] = rgb_to_dc(colours)
-    quats = torch.zeros(n, 4)
-    quats[:, 0] = 1
-    logit = torch.logit(torch.tensor(opacity)).expand(n).contiguous()
-    return GaussianTensors(points.contiguous(), quats, log_scales, logit, sh)
