@@ -109,8 +109,8 @@ def parser(prog: str = "p2gs") -> Parser:
     bench.add_argument("-c", "--config", **several, metavar="FILE", help="YAML files of benches (bench/paris.yaml), later ones laid on earlier ones")
     bench.add_argument("--root", metavar="DIR", help="the tree that holds the objects")
     bench.add_argument("--out", metavar="DIR", help="result folder (default runs/bench/<name>)")
-    for name, text in (("objects", "only these objects"), ("settings", "only these settings")):
-        bench.add_argument(f"--{name}", nargs="+", metavar="NAME", help=text)
+    bench.add_argument("--objects", nargs="+", metavar="NAME", help="these instead: benchmarks, object ids or scene folders below --root")
+    bench.add_argument("--settings", nargs="+", metavar="NAME", help="only these settings")
     bench.add_argument("--seeds", nargs="+", metavar="N", help="default 0 1 2")
     bench.add_argument("--executor", metavar="local|slurm|ray", help="where the runs are carried out (default local)")
     bench.add_argument("--processes", metavar="N", help="runs at once, for local (default 1)")

@@ -3,7 +3,7 @@
     name: paris                        # result folder runs/bench/<name> unless out says otherwise
     tables: [main_result]              # tables of the paper to fill (names of p2gs/bench/data/published/*.csv)
     root: data                         # the tree that holds the objects' folders; --root DIR
-    objects: [paris]                   # benchmarks or object ids; null: every scene folder below root
+    objects: [paris]                   # benchmarks, object ids or names of scene folders below root; null: every scene folder
     config: [preset/cpu.yaml]          # laid under every run
     settings:                          # name -> what it changes
       full: {}
@@ -230,8 +230,8 @@ def resolve_parts(wanted: Optional[Union[int, str]], scene: Scene) -> Optional[s
 
 
 def find_scenes(options: BenchOptions) -> Iterator[Scene]:
-    """The objects of a bench. Raises UserError where a listed one is not in the tree."""
-    from p2gs.data.objects import find_objects, pick_objects
+    """The objects of a bench, in its order. Raises UserError where a named one is not in the tree."""
+    from p2gs.data.objects import benchmarks, find_objects, pick_objects
 
     root = Path(options.root)
     if not root.is_dir():
@@ -239,14 +239,24 @@ def find_scenes(options: BenchOptions) -> Iterator[Scene]:
     if options.objects is None:
         yield from local_scenes(root)
         return
-    objects = pick_objects(options.objects)
-    places = find_objects(root, objects)
-    missing = [o.id for o in objects if o.id not in places]
+    known = {"all", *benchmarks(), *(o.id for group in benchmarks().values() for o in group)}
+    own = {s.name: s for s in local_scenes(root)} if set(options.objects) - known else {}
+    missing: list[str] = []
+    for name in dict.fromkeys(options.objects):
+        if name in own:
+            yield own[name]
+            continue
+        if name not in known:
+            raise UserError(f"objects: {root} has no scene '{name}', and no benchmark has{suggest(name, [*known, *own])}")
+        objects = pick_objects([name])
+        places = find_objects(root, objects)
+        missing += [o.id for o in objects if o.id not in places]
+        for o in objects:
+            if o.id in places:
+                where = places[o.id]
+                yield Scene(o.id, o.column, str(where.root), where.format, where.source, o.parts)
     if missing:
         raise UserError(f"{root}: lacks {', '.join(missing)} (p2gs data prepare {root} says more; --objects names fewer)")
-    for o in objects:
-        where = places[o.id]
-        yield Scene(o.id, o.column, str(where.root), where.format, where.source, o.parts)
 
 
 def local_scenes(root: Path) -> Iterator[Scene]:
@@ -277,7 +287,8 @@ def read_bench(
     """The bench of YAML files (merged in order, ``include`` works).
 
     words: overrides as on the command line; those that name no option of a bench (``--phases.articulation.steps 100``) go to every fit.
-    objects, settings: of those in the files, run these only. Raises UserError.
+    objects: instead of the files' (benchmarks, ids, or scene folders below root by name).  settings: of the files', these only.
+    Raises UserError.
     """
     schema = section_of(BenchOptions)
     own, for_fit = [], {}
@@ -294,24 +305,11 @@ def read_bench(
     given = {name: value for name, value in (tree.pop("settings", None) or {"full": {}}).items() if value is not None}
     given = {name: given[name] for name in only(settings, given, "settings")}
     if objects:
-        tree["objects"] = _narrowed(tree.get("objects"), objects)
+        tree["objects"] = list(objects)
     options: BenchOptions = build(complete(tree, schema), schema)
     one = section_of(Setting)
     built = {name: build(complete(v, one, f"settings.{name}."), one) for name, v in given.items()}
-    bench = Bench(options, built, {**tree, "settings": given})
-    if objects and options.objects is None:
-        bench.scenes = [s for s in bench.scenes if s.name in only(objects, [s.name for s in bench.scenes], "objects")]
-        bench.cells = list(bench._expand())
-    return bench
-
-
-def _narrowed(listed: Optional[list[str]], wanted: list[str]) -> Optional[list[str]]:
-    """The wanted ones of the listed benchmark objects; None (every folder) stays."""
-    from p2gs.data.objects import pick_objects
-
-    if listed is None:
-        return None
-    return only([o.id for o in pick_objects(wanted)], [o.id for o in pick_objects(listed)], "objects")
+    return Bench(options, built, {**tree, "settings": given})
 
 
 def _checked(tree: Plain, schema: Section, where: str) -> Plain:

@@ -1,0 +1,73 @@
+"""Tables as bar charts. The only file that imports matplotlib."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Sequence
+
+from p2gs.bench.grids import Entry, Grid
+from p2gs.bench.published import METRICS
+
+COLOURS = {"paper": ["#c9ccd1", "#a4a9b3", "#7f8794", "#5c6575", "#3c4454"], "ours": ["#e8602c", "#f29e4c", "#2a9d8f", "#8ac926", "#6a4c93"]}
+
+
+def plot(path: Path, grids: Sequence[Grid]) -> bool:
+    """One panel a metric, objects across, a bar a method, logarithmic where the numbers span more than a factor of 30.
+
+    Bars carry the standard deviation; a cross stands where the method failed. False where matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+    except ImportError:
+        return False
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    panels = [(grid, metric) for grid in grids for metric in METRICS if series(grid, metric)]
+    if not panels:
+        return False
+    columns = min(3, len(panels))
+    rows = -(-len(panels) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(6 * columns, 3.4 * rows), squeeze=False, layout="constrained")
+    for axis, (grid, metric) in zip(axes.flat, panels, strict=False):
+        draw(axis, grid, metric)
+    for axis in list(axes.flat)[len(panels) :]:
+        axis.axis("off")
+    figure.suptitle(grids[0].title)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return True
+
+
+def series(grid: Grid, metric: str) -> dict[tuple[str, str], dict[str, Entry]]:
+    """(method, kind) -> object -> entry, of the entries that say something."""
+    out: dict[tuple[str, str], dict[str, Entry]] = {}
+    for row in grid.rows:
+        for at, e in enumerate(row.entries):
+            if e.metric == metric and e.object and row.kind != "floor" and (e.mean is not None or e.text == "F"):
+                settings = len(grid.heads) == 3  # the layout with the settings across
+                method = f"{row.labels[-1]} {grid.columns[at]}" if settings else row.labels[-1].removeprefix(f"{e.object}, ")
+                out.setdefault((method, row.kind), {})[e.object] = e
+    return out
+
+
+def draw(axis, grid: Grid, metric: str) -> None:
+    """One panel."""
+    methods = series(grid, metric)
+    objects = list(dict.fromkeys(o for found in methods.values() for o in found))
+    width = 0.8 / len(methods)
+    counts = {"paper": 0, "ours": 0}
+    values = [e.mean for found in methods.values() for e in found.values() if e.mean is not None and e.mean > 0]
+    for i, ((method, kind), found) in enumerate(methods.items()):
+        at = [objects.index(o) + (i - (len(methods) - 1) / 2) * width for o in found]
+        colour = COLOURS[kind][counts[kind] % len(COLOURS[kind])]
+        counts[kind] += 1
+        heights = [e.mean or 0.0 for e in found.values()]
+        axis.bar(at, heights, width, yerr=[e.std or 0.0 for e in found.values()], color=colour, label=method, error_kw={"lw": 0.8})
+        lost = [x for x, e in zip(at, found.values(), strict=True) if e.text == "F" or e.lost[0]]
+        axis.plot(lost, [0.02] * len(lost), "x", color="crimson", transform=axis.get_xaxis_transform(), clip_on=False)
+    if values and max(values) > 30 * min(values):
+        axis.set_yscale("log")
+    axis.set_title(METRICS[metric].title + (" (higher is better)" if METRICS[metric].higher_is_better else ""), fontsize=10)
+    axis.set_xticks(range(len(objects)), objects, rotation=30, ha="right", fontsize=8)
+    axis.legend(fontsize=7)
