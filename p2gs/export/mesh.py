@@ -18,8 +18,8 @@ from p2gs.export.views import NamedCamera, bounds, orbit, read_cameras
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, UserError
 
 STATES = ("start", "end")
-RESOLUTION = 180  # voxels along the longest side of the object's box
-VIEWS = 48  # a state
+RESOLUTION = 160  # voxels along the longest side of the object's box
+VIEWS = 40  # a state
 FEATURES = 16  # channels a rasterizer takes at once
 
 

@@ -124,12 +124,12 @@ def _integrate(x: Tensor, views, maps, matrices, trunc: float, behind: float) ->
     """Signed distance in units of trunc [n], weight of surface sightings [n] and colour [n, 3] at points x [n, 3]."""
     total, weight = torch.zeros(len(x)), torch.full((len(x),), 1e-9)
     tint = torch.full((len(x), 4), 1e-9)
+    columns = x.T.contiguous()
     for view, table, M in zip(views, maps, matrices, strict=True):
         width, height = view.camera.width, view.camera.height
-        p = torch.addmm(M[:, 3], x, M[:, :3].T)
-        z = p[:, 2]
-        uv = p[:, :2] / z.clamp_min(1e-6)[:, None]
-        u, v = uv[:, 0], uv[:, 1]
+        p = torch.addmm(M[:, 3:], M[:, :3], columns)
+        z = p[2]
+        u, v = p[:2] / z.clamp_min(1e-6)
         pixel = v.clamp(0, height - 1).long() * width + u.clamp(0, width - 1).long()
         outside = (z < 1e-4) | (u < 0) | (v < 0) | (u >= width) | (v >= height)
         row = table.index_select(0, pixel.masked_fill_(outside, width * height))
