@@ -19,6 +19,8 @@ class DiscoveryConfig:
     min_angle, max_angle: degrees searched.  max_slide: times the box diagonal.
     attach: weight of the rule that a hinge touches the part it carries.
     slide_bonus: a slide has two degrees of freedom less than a turn: share of a part's gain in its favour.
+    split, split_fixed: least share of a part's residual that two amounts about its axis must remove ("auto", below a given number).
+    min_mass: least share of the moved surface of a part.  min_moved: fewest moved surfels a state below which nothing moved.
     candidates: how many complete explanations are handed back at most.
     """
 
@@ -29,10 +31,14 @@ class DiscoveryConfig:
     tolerance: float = 2.5
     unexplained: float = 0.45
     part_cost: float = 0.03
-    part_cost_fixed: float = 0.015
+    part_cost_fixed: float = 0.02
     min_angle: float = 5.0
     max_angle: float = 135.0
-    max_slide: float = 0.5
+    max_slide: float = 0.42
     attach: float = 0.5
-    slide_bonus: float = 0.15
+    slide_bonus: float = 0.1
+    split: float = 0.14
+    split_fixed: float = 0.12
+    min_mass: float = 0.015
+    min_moved: int = 12
     candidates: int = 4

@@ -39,11 +39,11 @@ class Landing:
     """Cost in 0..1 of a surfel arriving somewhere in one state.
 
     Arriving on a like surface costs nothing, inside space the state's cameras never saw 0.35, deep in space they saw to be
-    empty 1, on a surface that never moved 0.25 more.
+    empty 1, on a surface that never moved 0.2 more.
     """
 
     HIDDEN = 0.35
-    ON_STATIC = 0.25
+    ON_STATIC = 0.20
 
     def __init__(self, surfels: Surfels, static: Tensor, stack: DepthStack, lo: Tensor, hi: Tensor, scale: Scale, cells: float = 3e5):
         self.surfels, self.static, self.scale = surfels, static, scale

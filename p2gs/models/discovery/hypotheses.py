@@ -78,7 +78,7 @@ def arrival_table(landing: Landing, moved: Tensor) -> Tensor:
     centre = landing._centres(landing.coarse, landing.hc)
     near = landing.nearest.reshape(27, -1).long()
     d = (landing.surfels.points[near] - centre).norm(dim=2)
-    q = (1.75 - d / landing.hc).clamp(0, 1) * (0.6 * (~landing.static[near]).float() + 0.4 * moved[near].float())
+    q = (1.75 - d / landing.hc).clamp(0, 1) * (0.3 + 0.4 * (~landing.static[near]).float() + 0.3 * moved[near].float())
     return (q * 255).to(torch.uint8).reshape(-1)
 
 

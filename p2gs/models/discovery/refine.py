@@ -40,12 +40,13 @@ def normal_equations(problem: Problem, motions: Motions, samples: list[Tensor], 
     return A, b
 
 
-def gauss_newton(problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], rounds: int = 8) -> Motions:
-    """A few damped steps with a kernel shrinking from two coarse voxels to the surface tolerance."""
+def gauss_newton(problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], rounds: int = 8, width0=None, width1=None) -> Motions:
+    """A few damped steps with a kernel shrinking from ``width0`` (1.5 coarse voxels) to ``width1`` (the surface tolerance)."""
     hc, tp = problem.landings[0].hc, problem.scale.tp
+    width0, width1 = width0 or 1.5 * hc, width1 or tp
     unit = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0])
     for k in range(rounds):
-        width = 1.5 * hc * (tp / (1.5 * hc)) ** (k / max(1, rounds - 1))
+        width = width0 * (width1 / width0) ** (k / max(1, rounds - 1))
         A, b = normal_equations(problem, motions, samples, weights, width)
         trace = A.diagonal(dim1=1, dim2=2).sum(1).clamp_min(1e-12)
         A = A + torch.diag_embed(0.02 * trace[:, None] * unit)

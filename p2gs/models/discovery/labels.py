@@ -1,0 +1,101 @@
+"""Which surfel belongs to which motion: landing costs of every point under every label, made to agree among neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from p2gs.models.discovery.problem import Problem
+from p2gs.models.discovery.rigid import Motions
+
+
+@dataclass
+class Graph:
+    """k nearest neighbours: index [N, k], weight [N, k] (rows sum to 1), smaller across creases, steps in colour and distance."""
+
+    index: Tensor
+    weight: Tensor
+
+    @staticmethod
+    def build(points: Tensor, normals: Tensor, colours: Tensor, k: int = 10) -> "Graph":
+        k = min(k, len(points) - 1)
+        d, j = cKDTree(points.numpy()).query(points.numpy(), k=k + 1)
+        d, j = torch.from_numpy(d[:, 1:].astype(np.float32)), torch.from_numpy(j[:, 1:])
+        facing = (normals[j] * normals[:, None]).sum(2).clamp(-1, 1)
+        colour = (colours[j] - colours[:, None]).abs().mean(2)
+        w = torch.exp(-((d / (1.5 * d[:, -1:].median())) ** 2)) * torch.exp(-1.5 * (1 - facing)) * torch.exp(-4 * colour) + 1e-4
+        return Graph(j, w / w.sum(1, keepdim=True))
+
+    def average(self, values: Tensor) -> Tensor:
+        """values [N, K] -> weighted mean over neighbours [N, K]."""
+        return torch.einsum("nk,nkc->nc", self.weight, values[self.index])
+
+
+def unary(problem: Problem, motions: Motions, state: int) -> Tensor:
+    """Cost [N, K + 1] of every surfel of ``state`` under static (column 0) and each motion."""
+    n = len(problem.surfels[state])
+    moved, static = problem.moved[state], problem.static[state]
+    rest = torch.full((n,), 0.22)
+    rest[static] = 0.02
+    rest[moved] = 1.0
+    columns = [rest]
+    index = torch.arange(n)
+    for k in range(len(motions)):
+        c = problem.cost(motions[k : k + 1], state, index)[0][0]
+        columns.append(c + torch.where(moved, 0.0, 0.06))
+    return torch.stack(columns, 1)
+
+
+def smooth_labels(cost: Tensor, graph: Graph, diffuse: int = 8, rounds: int = 15, pull: float = 2.5, sharp: float = 12.0) -> Tensor:
+    """Probabilities [N, K + 1]: costs diffused along the surface, then a mean-field Potts model.
+
+    pull: weight of the neighbours' labels.  sharp: probabilities are softmax of -sharp * cost.
+    """
+    smooth = cost
+    for _ in range(diffuse):
+        smooth = 0.5 * cost + 0.5 * graph.average(smooth)
+    p = torch.softmax(-sharp * smooth, 1)
+    for _ in range(rounds):
+        p = torch.softmax(-sharp * smooth + pull * graph.average(p), 1)
+    return p
+
+
+@dataclass
+class Labelling:
+    """Per state: probabilities [N, K + 1] and unary costs [N, K + 1]."""
+
+    probability: list[Tensor]
+    cost: list[Tensor]
+
+    def labels(self, state: int) -> Tensor:
+        return self.probability[state].argmax(1)
+
+    def margin(self, state: int) -> Tensor:
+        """Best less second-best probability [N]."""
+        p = self.probability[state]
+        if p.shape[1] == 1:
+            return torch.ones(len(p))
+        top = p.topk(2, dim=1).values
+        return top[:, 0] - top[:, 1]
+
+
+def label(problem: Problem, motions: Motions, graphs: list[Graph], agree: int = 2) -> Labelling:
+    """Label both states; after a first pass, points pay for landing on a surface that the other state labels differently."""
+    costs = [unary(problem, motions, s) for s in (0, 1)]
+    p = [smooth_labels(costs[s], graphs[s]) for s in (0, 1)]
+    for _ in range(agree):
+        extra = []
+        for s in (0, 1):
+            add = torch.zeros_like(costs[s])
+            index = torch.arange(len(costs[s]))
+            for k in range(len(motions)):
+                c, j = problem.cost(motions[k : k + 1], s, index)
+                met = c[0] < 0.25
+                add[:, k + 1] = torch.where(met, 0.25 * (1 - p[1 - s][j[0], k + 1]), torch.zeros(()))
+            extra.append(add)
+        p = [smooth_labels(costs[s] + extra[s], graphs[s]) for s in (0, 1)]
+    return Labelling(p, costs)

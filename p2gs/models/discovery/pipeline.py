@@ -1,0 +1,166 @@
+"""Two reconstructed states -> parts, motions, labels: the stages in order."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Callable, Optional
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from p2gs.models.discovery.config import DiscoveryConfig
+from p2gs.models.discovery.evidence import StateEvidence
+from p2gs.models.discovery.finish import Explanation, settle_parts, split_amounts, with_amounts
+from p2gs.models.discovery.hypotheses import directions, sweep
+from p2gs.models.discovery.labels import Graph, Labelling
+from p2gs.models.discovery.problem import Problem, build_problem
+from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
+from p2gs.models.discovery.rigid import Motions
+from p2gs.models.discovery.search import Search, plausibility
+from p2gs.models.discovery.verify import image_score, violation
+from p2gs.types import UserError
+
+
+def discover(
+    start: StateEvidence,
+    end: StateEvidence,
+    num_parts: "int | str" = "auto",
+    config: Optional[DiscoveryConfig] = None,
+    seed: int = 0,
+    progress: Optional[Callable[[str, float], None]] = None,
+) -> Discovery:
+    """Find the moving parts, their motions and who belongs to them. No ground truth, no learning.
+
+    num_parts: upper bound that counts the static base, or "auto".  progress: called with a stage's name and the share done.
+    Raises UserError for a bad ``num_parts``.  Deterministic for a seed.
+    """
+    config = config or DiscoveryConfig()
+    if num_parts != "auto" and (not isinstance(num_parts, int) or num_parts < 1):
+        raise UserError(f"num_parts is {num_parts!r}, expected 'auto' or a whole number of parts that counts the static base")
+    fixed = num_parts != "auto"
+    limit = (num_parts if fixed else config.max_parts) - 1
+    tell = progress or (lambda stage, share: None)
+    clock, seconds = time.perf_counter(), {}
+
+    def lap(stage: str, share: float) -> None:
+        nonlocal clock
+        now = time.perf_counter()
+        seconds[stage], clock = round(now - clock, 2), now
+        tell(stage, share)
+
+    problem, figures = build_problem(start, end, config, seed)
+    lap("evidence", 0.2)
+    graphs = [Graph.build(s.points, s.normals, s.colours) for s in problem.surfels]
+    explanations: list[Explanation] = []
+    if limit > 0 and min(len(s) for s in problem.samples) >= config.min_moved:
+        axes = directions(problem)
+        swept = sweep(problem, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in problem.samples])
+        lap("hypotheses", 0.4)
+        search = Search(problem, swept, limit, config.part_cost_fixed if fixed else config.part_cost)
+        solutions = search.solve()
+        lap("selection", 0.7)
+        figures |= {"axes": axes.tolist(), "motions_tried": len(swept.motions), "search": search.trace}
+        for value, chosen in solutions[: config.candidates]:
+            if value > 0 and chosen and value > solutions[0][0] - 0.15:
+                explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, limit, fixed))
+        lap("labels", 0.95)
+    if not explanations:
+        nothing = [torch.ones(len(s), 1) for s in problem.surfels]
+        explanations = [Explanation(Motions.empty(), Labelling(nothing, nothing), 0.0)]
+    explanations.sort(key=lambda e: e.score)
+    candidates = [describe(problem, e, start, end) for e in explanations]
+    best = candidates[0]
+    out = Discovery(
+        motions=best.motions, surfels=best.surfels, probability=best.probability, score=best.score, value=best.value,
+        labels_start=best.labels_start, labels_end=best.labels_end, candidates=candidates, diagnostics=figures | {"seconds": seconds},
+    )  # fmt: skip
+    out.margin_start = best.label_points(start.points, start.colours, 0)[1]
+    out.margin_end = best.label_points(end.points, end.colours, 1)[1]
+    out.evidence_start, out.evidence_end = (nearest_evidence(problem, e.points, s) for s, e in enumerate((start, end)))
+    out.diagnostics["candidates"] = [
+        {"score": round(c.score, 4), "value": round(c.value, 4), "parts": [(m.type, round(m.amount, 4), round(m.confidence, 3)) for m in c.motions]}
+        for c in candidates
+    ]
+    lap("description", 1.0)
+    return out
+
+
+def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, fixed: bool) -> Explanation:
+    """Label and fit a chosen set; part those that share an axis but not an amount; drop parts without mass; score in image space."""
+    cfg = problem.config
+    motions, labelling = settle_parts(problem, graphs, motions)
+    while len(motions) < limit:
+        tried = [split_amounts(problem, labelling, graphs, motions, k) for k in range(len(motions))]
+        k = max(range(len(tried)), key=lambda i: tried[i][0])
+        if tried[k][0] < (cfg.split_fixed if fixed else cfg.split):
+            break
+        more, relabelled = settle_parts(problem, graphs, with_amounts(motions, k, *tried[k][1:]))
+        if min(masses(problem, relabelled)) < cfg.min_mass:
+            break
+        motions, labelling = more, relabelled
+    while len(motions):
+        mass = masses(problem, labelling)
+        k = min(range(len(mass)), key=lambda i: mass[i])
+        if mass[k] >= cfg.min_mass:
+            break
+        motions = motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
+        motions, labelling = settle_parts(problem, graphs, motions, rounds=1)
+    mass = masses(problem, labelling)
+    pays = [p for p in problem.pay(motions)] if len(motions) else []
+    doubt = float((torch.tensor(mass) * (1 - plausibility(problem, motions, pays, problem.samples))).sum()) if len(motions) else 0.0
+    score = image_score(problem, motions, labelling) + cfg.part_cost * len(motions) + 0.5 * doubt
+    return Explanation(motions, labelling, value, score)
+
+
+def masses(problem: Problem, labelling: Labelling) -> list[float]:
+    """Share of the moved surface of each part, mean of both states."""
+    K = labelling.probability[0].shape[1] - 1
+    out = torch.zeros(K)
+    for s in (0, 1):
+        labels = labelling.labels(s)[problem.moved[s]]
+        if len(labels):
+            out += torch.bincount(labels, minlength=K + 1)[1:] / len(labels) / 2
+    return out.tolist()
+
+
+def describe(problem: Problem, e: Explanation, start: StateEvidence, end: StateEvidence) -> Candidate:
+    """Motions in words, confidences, labels of the input points."""
+    found = []
+    mass = masses(problem, e.labelling)
+    bad = [violation(problem, e.motions, e.labelling.labels(s), s) for s in (0, 1)]
+    pays = problem.pay(e.motions) if len(e.motions) else []
+    plausible = plausibility(problem, e.motions, pays, problem.samples) if len(e.motions) else torch.zeros(0)
+    for k in range(len(e.motions)):
+        T = e.motions.transform(k)
+        turn = bool(e.motions.turn[k])
+        mine = [e.labelling.labels(s) == k + 1 for s in (0, 1)]
+        agree = [1 - float(bad[s][mine[s]].mean()) if mine[s].any() else 0.0 for s in (0, 1)]
+        middle = problem.surfels[0].points[mine[0]].mean(0).double() if mine[0].any() else problem.centre.double()
+        axis = e.motions.axis[k].double()
+        axis = axis / axis.norm()
+        origin = e.motions.centre[k].double()
+        origin = origin + axis * ((middle - origin) @ axis) if turn else middle
+        found.append(
+            FoundMotion(
+                type="revolute" if turn else "prismatic", transform=T, axis=axis, origin=origin,
+                amount=math.degrees(float(e.motions.amount[k])) if turn else float(e.motions.amount[k]),
+                confidence=float(max(0.0, min(agree)) * plausible[k].clamp(0, 1) * min(1.0, mass[k] / 0.05)), mass=mass[k],
+            )
+        )  # fmt: skip
+    c = Candidate(found, problem.surfels, e.labelling.probability, e.score, e.value)
+    c.labels_start = c.label_points(start.points, start.colours, 0)[0]
+    c.labels_end = c.label_points(end.points, end.colours, 1)[0]
+    return c
+
+
+def nearest_evidence(problem: Problem, points: Tensor, state: int) -> Tensor:
+    """1 moved, 0 static, -1 unknown, of the surfel nearest to each point."""
+    surf = problem.surfels[state]
+    j = torch.from_numpy(np.asarray(cKDTree(surf.points.numpy()).query(points.detach().cpu().float().numpy())[1]))
+    e = torch.full((len(surf),), -1, dtype=torch.long)
+    e[problem.static[state]] = 0
+    e[problem.moved[state]] = 1
+    return e[j]
