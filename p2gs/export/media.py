@@ -87,19 +87,16 @@ def write_media(obj: ArticulatedObject, media_dir: Path, cameras: Sequence[Camer
 
 
 def _compare_row(obj, state: int, camera: Camera, size: int, photos) -> np.ndarray:
-    t, name = float(state), ("start", "end")[state]
-    cells = []
+    """Photograph (where there is one), twin and parts of a state, all from the photograph's camera and as large as ``camera``."""
+    t, name, cells = float(state), ("start", "end")[state], []
+    shape = camera.width, camera.height + CAPTION
     if photos is not None:
         photo, taken = photos(state)
-        near, window = framed(obj, taken, size)
-        x, y, w, h = window
-        cells.append(captioned(resize(photo[y : y + h, x : x + w], near.width, near.height), f"photograph ({name})"))
-        cells.append(captioned(render_plain(obj, near, t), f"twin ({name})"))
-        cells[:] = [fit(c, camera.width, camera.height + CAPTION) for c in cells]
-    else:
-        cells.append(captioned(render_plain(obj, camera, t), f"twin ({name})"))
+        camera, (x, y, w, h) = framed(obj, taken, size)
+        cells.append(captioned(resize(photo[y : y + h, x : x + w], camera.width, camera.height), f"photograph ({name})"))
+    cells.append(captioned(render_plain(obj, camera, t), f"twin ({name})"))
     cells.append(captioned(render_parts(obj, camera, t), f"parts and joints ({name})"))
-    return beside(cells)
+    return beside([fit(c, *shape) for c in cells])
 
 
 CAPTION, GAP = 26, 6

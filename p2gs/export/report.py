@@ -223,7 +223,7 @@ def chip(part: int) -> str:
 
 
 def _vector(v: Any) -> str:
-    return "(" + ", ".join(f"{float(x):.3f}" for x in v) + ")"
+    return "(" + ", ".join(f"{round(float(x), 3) + 0.0:.3f}" for x in v) + ")"
 
 
 def _number(value: Optional[float]) -> str:
