@@ -27,17 +27,27 @@ def render_depths(g: GaussianTensors, cameras: list[Camera], backend: str = "aut
     return depths, alphas
 
 
+def object_window(view: View, size: int, margin: float = 0.06) -> Camera:
+    """The camera of a square window around the view's mask, ``size`` pixels wide: small objects get as many pixels as large ones."""
+    rows, cols = view.alpha.amax(1).nonzero().squeeze(1), view.alpha.amax(0).nonzero().squeeze(1)
+    if rows.numel() == 0:
+        return view.camera.scaled(size, size)
+    top, left = int(rows[0]), int(cols[0])
+    height, width = int(rows[-1]) + 1 - top, int(cols[-1]) + 1 - left
+    side = round(max(height, width) * (1 + 2 * margin)) + 2
+    window = view.camera.cropped(left + (width - side) // 2, top + (height - side) // 2, side, side)
+    return window.scaled(size, size)
+
+
 def gather_evidence(g: GaussianTensors, views: list[View], size: int, min_opacity: float, backend: str = "auto", device="cpu") -> StateEvidence:
     """Evidence of one state: centres and colours of its solid Gaussians, depth and alpha maps of its training views.
 
-    size: long edge of the maps in pixels. Gaussians below ``min_opacity`` are left out of the points.
+    size: side of the maps in pixels; each shows the object's window of its view. Gaussians below ``min_opacity`` are left out of
+    the points.
     """
     from p2gs.ops.sh import dc_to_rgb
 
-    cameras = []
-    for view in views:
-        factor = size / max(view.camera.width, view.camera.height)
-        cameras.append(view.camera.scaled(max(round(view.camera.width * factor), 1), max(round(view.camera.height * factor), 1)))
+    cameras = [object_window(view, size) for view in views]
     depths, alphas = render_depths(g, cameras, backend, device)
     solid = torch.sigmoid(g.opacity_logits) > min_opacity
     return StateEvidence(
