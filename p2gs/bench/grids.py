@@ -142,9 +142,9 @@ def mark_best(rows: Sequence[Row]) -> None:
     for (_, metric), entries in groups.items():
         if len(entries) < 2:
             continue
-        best = (max if METRICS[metric].higher_is_better else min)(round(e.mean, METRICS[metric].digits) for e in entries)
+        best = (max if METRICS[metric].higher_is_better else min)(round(e.mean, e.digits) for e in entries)
         for e in entries:
-            e.best = round(e.mean, METRICS[metric].digits) == best
+            e.best = round(e.mean, e.digits) == best
 
 
 # -- layouts -----------------------------------------------------------------------------------------------------------------------
@@ -153,8 +153,8 @@ def mark_best(rows: Sequence[Row]) -> None:
 def fill(table: PaperTable, results: Results) -> list[Grid]:
     """The table's grids: one, or two where the bench has none of the paper's objects (ours, then the paper's own)."""
     filled = Filled(table, results)
-    if filled.overlap or not filled.foreign:
-        return [_grid(filled, table.objects if table.layout != "average" else filled.overlap, filled.foreign, table.title)]
+    if filled.overlap or not filled.foreign or table.layout == "average":
+        return [_grid(filled, table.objects, filled.foreign, table.title)]
     ours = _grid(filled, [], filled.foreign, table.title + ": objects that the paper does not have")
     ours.rows = [r for r in ours.rows if r.kind != "paper"]
     for row in ours.rows:

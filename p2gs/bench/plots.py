@@ -28,11 +28,15 @@ def plot(path: Path, grids: Sequence[Grid]) -> bool:
         return False
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(6 * columns, 3.4 * rows), squeeze=False, layout="constrained")
+    bars = max(len(series(grid, metric)) for grid, metric in panels)
+    figure, axes = plt.subplots(rows, columns, figsize=(5.5 * columns, 3.6 * rows + 0.4 + 0.12 * bars), squeeze=False, layout="constrained")
+    handles = {}
     for axis, (grid, metric) in zip(axes.flat, panels, strict=False):
         draw(axis, grid, metric)
+        handles |= {text: handle for handle, text in zip(*axis.get_legend_handles_labels(), strict=True)}
     for axis in list(axes.flat)[len(panels) :]:
-        axis.axis("off")
+        axis.remove()
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 2 * columns), fontsize=8)
     figure.suptitle(grids[0].title)
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -54,20 +58,26 @@ def series(grid: Grid, metric: str) -> dict[tuple[str, str], dict[str, Entry]]:
 def draw(axis, grid: Grid, metric: str) -> None:
     """One panel."""
     methods = series(grid, metric)
-    objects = list(dict.fromkeys(o for found in methods.values() for o in found))
+    there = {o for found in methods.values() for o in found}
+    objects = [o for o in dict.fromkeys(e.object for row in grid.rows for e in row.entries) if o in there]
     width = 0.8 / len(methods)
     counts = {"paper": 0, "ours": 0}
     values = [e.mean for found in methods.values() for e in found.values() if e.mean is not None and e.mean > 0]
+    # bars stand on a base above zero where the axis is logarithmic: zero is nowhere on it
+    base = 0.5 * min(values) if values and max(values) > 30 * min(values) else 0.0
     for i, ((method, kind), found) in enumerate(methods.items()):
         at = [objects.index(o) + (i - (len(methods) - 1) / 2) * width for o in found]
         colour = COLOURS[kind][counts[kind] % len(COLOURS[kind])]
         counts[kind] += 1
         heights = [e.mean or 0.0 for e in found.values()]
-        axis.bar(at, heights, width, yerr=[e.std or 0.0 for e in found.values()], color=colour, label=method, error_kw={"lw": 0.8})
+        heights = [max(h - base, 0.0) for h in heights]
+        up = [e.std or 0.0 for e in found.values()]
+        down = [min(s, h) for s, h in zip(up, heights, strict=True)]
+        axis.bar(at, heights, width, base, yerr=[down, up], color=colour, label=method, error_kw={"lw": 0.8})
         lost = [x for x, e in zip(at, found.values(), strict=True) if e.text == "F" or e.lost[0]]
-        axis.plot(lost, [0.02] * len(lost), "x", color="crimson", transform=axis.get_xaxis_transform(), clip_on=False)
-    if values and max(values) > 30 * min(values):
+        axis.plot(lost, [0.03] * len(lost), "x", color="crimson", transform=axis.get_xaxis_transform())
+    if base:
         axis.set_yscale("log")
+        axis.set_ylim(bottom=base)
     axis.set_title(METRICS[metric].title + (" (higher is better)" if METRICS[metric].higher_is_better else ""), fontsize=10)
     axis.set_xticks(range(len(objects)), objects, rotation=30, ha="right", fontsize=8)
-    axis.legend(fontsize=7)

@@ -26,7 +26,7 @@ def markdown_entry(e: Entry) -> str:
         mean, std = number(e)
         text = f"{mean} ± {std}" if std else mean
         text = (f"**{text}**" if e.best else text) + lost(e)
-    return text + "".join(f"<sup>{n}</sup>" for n in e.notes)
+    return text + (f"<sup>{','.join(map(str, e.notes))}</sup>" if e.notes else "")
 
 
 def latex_entry(e: Entry) -> str:
@@ -36,7 +36,7 @@ def latex_entry(e: Entry) -> str:
         mean, std = number(e)
         text = f"{mean}_{{\\pm {std}}}" if std else mean
         text = (f"$\\mathbf{{{text}}}$" if e.best else f"${text}$") + lost(e)
-    return text + "".join(f"\\textsuperscript{{{n}}}" for n in e.notes)
+    return text + (f"\\textsuperscript{{{','.join(map(str, e.notes))}}}" if e.notes else "")
 
 
 def escape(text: str) -> str:

@@ -24,11 +24,13 @@ def test(args: argparse.Namespace) -> int:
     """Score a run, write metrics.json, print the figures."""
     from rich import print as rich_print
 
+    from p2gs.callbacks.hparams import write_hparams
     from p2gs.export.evaluate import evaluate_run
     from p2gs.export.score_table import score_tables
 
     run = finished_run(args.run)
     rich_print(score_tables(evaluate_run(run, args.root)))
+    write_hparams(run)
     print(f"written: {run / 'metrics.json'}")
     return 0
 
