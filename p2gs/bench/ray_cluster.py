@@ -31,11 +31,12 @@ class RayExecutor:
         rooms = [have[name] // need for name, need in (("CPU", o.cpus), ("GPU", o.gpus)) if need > 0]
         self.slots = max(int(min(rooms, default=1)), 1)
         self.threads = options.threads or max(int(o.cpus), 1)
-        self.task = ray.remote(num_cpus=o.cpus, num_gpus=o.gpus, max_retries=0)(work)
+        self.work = work
+        self.task = ray.remote(num_cpus=o.cpus, num_gpus=o.gpus, max_retries=0)(carry_out)
         self.jobs: list[RayJob] = []
 
     def start(self, cell: Cell):
-        self.jobs.append(RayJob(self.ray, self.task.remote(replace(cell, threads=self.threads))))
+        self.jobs.append(RayJob(self.ray, self.task.remote(self.work, replace(cell, threads=self.threads))))
         return self.jobs[-1]
 
     def close(self, stop: bool) -> None:
@@ -45,6 +46,11 @@ class RayExecutor:
                     self.ray.cancel(job.reference, force=True)
         if self.started:
             self.ray.shutdown()
+
+
+def carry_out(work, cell: Cell) -> Outcome:
+    """The task."""
+    return work(cell)
 
 
 class RayJob:
