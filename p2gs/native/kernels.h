@@ -8,8 +8,9 @@
 #include <cstdint>
 
 #include "adam.h"
-#include "ssim.h"
+#include "knn.h"
 #include "raster.h"
+#include "ssim.h"
 
 namespace p2gs {
 
@@ -18,6 +19,7 @@ struct Kernels {
     AdamKernels adam;
     SsimKernels ssim;
     RasterKernels raster;
+    KnnKernels knn;
 };
 
 namespace avx512 { extern const Kernels table; }

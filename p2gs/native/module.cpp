@@ -59,4 +59,5 @@ NB_MODULE(_native, m) {
     bind_adam(m);
     bind_ssim(m);
     bind_raster(m);
+    bind_knn(m);
 }

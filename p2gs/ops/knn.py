@@ -1,4 +1,4 @@
-"""Nearest neighbours: a kd-tree on the CPU, blocks of distances on a GPU."""
+"""Nearest neighbours: a native tree on the CPU, all distances in blocks elsewhere."""
 
 from __future__ import annotations
 
@@ -7,48 +7,59 @@ from typing import Optional
 import torch
 from torch import Tensor
 
-from p2gs.native import num_threads
+from p2gs.native import native, num_threads
 
 
 @torch.no_grad()
 def knn(points: Tensor, queries: Optional[Tensor], k: int, exclude_self: bool = False) -> tuple[Tensor, Tensor]:
-    """The k nearest of ``points`` to each of ``queries`` (None: the points themselves), nearest first.
+    """The k nearest of ``points`` to each of ``queries`` (None: the points themselves), nearest first, ties by index.
 
     points [N, 3], queries [M, 3], finite.  exclude_self: query i is point i and shall not find itself; a twin at the same place
-    does count.  Returns (distances [M, k] in the points' dtype, indices [M, k] int64), both without gradient. The same input gives
-    the same answer, for any number of threads.
+    does count.  Returns (distances [M, k] in the points' dtype, indices [M, k] int64), both without gradient. The same bits for any
+    number of threads.
     Raises ValueError when there are fewer than k points to find, when exclude_self is asked of foreign queries, or on NaN.
     """
-    if exclude_self and queries is not None and queries.shape[0] != points.shape[0]:
-        raise ValueError(f"exclude_self wants one query a point, got {queries.shape[0]} queries for {points.shape[0]} points")
-    queries = points if queries is None else queries
-    wanted = k + bool(exclude_self)
-    if k < 1 or wanted > points.shape[0]:
-        raise ValueError(f"{k} neighbours asked of {points.shape[0]} points" + (" with the point itself left out" if exclude_self else ""))
-    search = _tree if points.device.type == "cpu" else knn_reference
-    distance, index = search(points, queries, wanted)
-    if not exclude_self:
-        return distance, index
-    # Leave out the point itself; where more than k twins hide it, leave out the last found instead.
-    own = index == torch.arange(index.shape[0], device=index.device)[:, None]
-    own[:, -1] |= ~own.any(dim=1)
-    shape = (index.shape[0], k)
-    return distance[~own].view(shape), index[~own].view(shape)
+    for name, x in (("points", points), ("queries", queries)):
+        if x is None:
+            continue
+        if x.ndim != 2 or x.shape[1] != 3:
+            raise ValueError(f"knn wants {name} [N, 3], got {tuple(x.shape)}")
+        if x.numel() and not x.abs().max() < 1e18:
+            raise ValueError(f"knn wants finite {name}")
+    if exclude_self and queries is not None and queries is not points:
+        raise ValueError("exclude_self is for the points' own neighbours: give queries as None")
+    if k < 1 or k + bool(exclude_self) > points.shape[0]:
+        raise ValueError(f"{k} neighbours asked of {points.shape[0]} points" + (", each without itself" if exclude_self else ""))
+    queries = None if queries is points else queries
+    if native is None or points.dtype != torch.float32 or points.device.type != "cpu":
+        return knn_reference(points, queries, k, exclude_self)
+    points = points.contiguous()
+    queries = None if queries is None else queries.to(points).contiguous()
+    count = points.shape[0]
+    asked = count if queries is None else queries.shape[0]
+    distance = points.new_empty(asked, k)
+    index = torch.empty(asked, k, dtype=torch.int64)
+    address = 0 if queries is None else queries.data_ptr()
+    if asked:
+        native.knn(points.data_ptr(), count, address, asked, k, exclude_self, distance.data_ptr(), index.data_ptr(), num_threads())
+    return distance, index
 
 
-def _tree(points: Tensor, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    from scipy.spatial import cKDTree
-
-    # Sliding midpoint instead of medians: half the time to build, and as fast to ask for points on surfaces.
-    tree = cKDTree(points.detach().double().numpy(), balanced_tree=False, compact_nodes=False)
-    distance, index = tree.query(queries.detach().double().numpy(), k=range(1, k + 1), workers=num_threads())
-    return torch.from_numpy(distance).to(points.dtype), torch.from_numpy(index).long()
-
-
-def knn_reference(points: Tensor, queries: Tensor, k: int, block: int = 4096) -> tuple[Tensor, Tensor]:
-    """All distances, ``block`` queries at a time, in any dtype and on any device: for GPUs, and to hold the tree against."""
+@torch.no_grad()
+def knn_reference(
+    points: Tensor, queries: Optional[Tensor], k: int, exclude_self: bool = False, block: int = 4_000_000
+) -> tuple[Tensor, Tensor]:
+    """``knn`` by all distances, ``block`` of them at a time: any dtype and device."""
+    queries = points if queries is None else queries.to(points)
+    rows = max(1, block // points.shape[0])
     found = []
-    for part in queries.split(block):
-        distance = torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist")
+    for start in range(0, queries.shape[0], rows):
+        part = queries[start : start + rows]
+        distance = torch.linalg.vector_norm(part[:, None] - points[None], dim=-1)
+        if exclude_self:
+            here = torch.arange(part.shape[0], device=points.device)
+            distance[here, start + here] = torch.inf
         found.append(distance.topk(k, largest=False, sorted=True))
+    if not found:
+        return points.new_empty(0, k), torch.empty(0, k, dtype=torch.int64, device=points.device)
     return torch.cat([d for d, _ in found]), torch.cat([i for _, i in found])
