@@ -92,17 +92,22 @@ class Loss:
 
     weight: factor in the total.  start, end: active while start <= step / total_steps < end (fractions of the phase).
     end_weight: when given, the weight moves from ``weight`` to it, geometrically, between start and end.
+    every: looked at in one step of so many, with its weight multiplied by that number: the same on average at a part of the cost.
     """
 
     weight: float = 1.0
     start: float = 0.0
     end: float = 1.0
     end_weight: Optional[float] = None
+    every: int = 1
 
     def active(self, step: int, total_steps: int) -> bool:
-        return self.weight != 0 and self.start <= step / max(total_steps, 1) < self.end
+        return self.weight != 0 and step % self.every == 0 and self.start <= step / max(total_steps, 1) < self.end
 
     def weight_at(self, step: int, total_steps: int) -> float:
+        return self.every * self._scheduled(step, total_steps)
+
+    def _scheduled(self, step: int, total_steps: int) -> float:
         if self.end_weight is None:
             return self.weight
         span = max(self.end - self.start, 1e-9)

@@ -22,6 +22,9 @@ from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors
 
 
+IMAGE_LOSSES = ("render", "alpha", "depth", "depth_variance", "opacity")  # they look at no part state, which costs time to make
+
+
 @dataclass
 class RepelConfig:
     """Repel points (paper section 4.3, appendix). count: N_R.  threshold: how near to the static base a movable part must be,
@@ -138,22 +141,28 @@ class ArticulationPhase(ImagePhase):
         g = self.splats.tensors()
         probs = self.head(self.splats.psi, self.temperature(step))
         render = self.render(blend_move(g, probs, self.screws.at(state - self.times)), camera, target.background)
-        return LossInputs(step, self.total_steps, g, render, target, camera, self.part_state(step, g, probs), self.loss_cache)
+        self.refresh(step, g, probs)
+        due = any(loss.active(step, self.total_steps) for name, loss in self.losses.items() if name not in IMAGE_LOSSES)
+        return LossInputs(step, self.total_steps, g, render, target, camera, self.part_state(g, probs) if due else None, self.loss_cache)
 
-    def part_state(self, step: int, g: GaussianTensors, probs: Tensor) -> PartState:
-        """The losses' view of this step; neighbours and pairs are renewed every ``refresh`` steps."""
-        if step % self.config.refresh == 0 or len(self.knn_index) != len(g):
-            distance, self.knn_index = knn(g.means.detach(), None, min(self.config.neighbours, len(g) - 1), True)
-            self.spacing = distance[:, 0].median()
-            if self.config.pair_target == "nearest" and step >= self.config.nearest_from * self.total_steps:
-                self.renew_pairs(g, probs.detach())
+    def refresh(self, step: int, g: GaussianTensors, probs: Tensor) -> None:
+        """Renew neighbours and observed pairs every ``refresh`` steps."""
+        if step % self.config.refresh and len(self.knn_index) == len(g):
+            return
+        distance, self.knn_index = knn(g.means.detach(), None, min(self.config.neighbours, len(g) - 1), True)
+        self.spacing = distance[:, 0].median()
+        if self.config.pair_target == "nearest" and step >= self.config.nearest_from * self.total_steps:
+            self.renew_pairs(g, probs.detach())
+
+    def part_state(self, g: GaussianTensors, probs: Tensor) -> PartState:
+        """The losses' view of this step."""
         pairs = self.splats.paired.nonzero().squeeze(1)
         mu0, mu1 = self.splats.mu0[pairs], self.splats.mu1[pairs]
         target_rotation = None
-        if "art" in self.losses and pairs.numel() >= 3:
+        if self._active("art") and pairs.numel() >= 3:
             weights = probs.detach()[pairs].T + 1e-9
             target_rotation = so3.kabsch(mu0.expand(len(weights), -1, 3), mu1.expand(len(weights), -1, 3), weights)[0]
-        hardness = (self.config.temperature - self.temperature(step)) / max(self.config.temperature - self.config.temperature_end, 1e-9)
+        hardness = (self.config.temperature - self.temperature(self.step)) / max(self.config.temperature - self.config.temperature_end, 1e-9)
         uniform = bool((self.times == self.times[0]).all())
         return PartState(
             probs=probs,

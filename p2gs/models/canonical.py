@@ -80,7 +80,7 @@ def carry(g: GaussianTensors, labels: Tensor, transforms: Tensor) -> GaussianTen
     """Gaussians moved by the rigid motion of their part. transforms [K, 4, 4], slot 0 included."""
     T = transforms.to(g.means)
     R = T[:, :3, :3]
-    means = torch.einsum("nij,nj->ni", R[labels], g.means) + T[labels, :3, 3]
+    means = (R[labels] * g.means[:, None, :]).sum(-1) + T[labels, :3, 3]
     quats = so3.quat_multiply(so3.matrix_to_quat(R)[labels], so3.quat_normalize(g.quats))
     return GaussianTensors(means, quats, g.log_scales, g.opacity_logits, g.sh)
 

@@ -40,8 +40,8 @@ def initial_screws(kind: str, parts: int, generator: torch.Generator) -> Tensor:
 def blend_move(g: GaussianTensors, probs: Tensor, transforms: Tensor) -> GaussianTensors:
     """mu' = sum_k p_k (R_k mu + t_k); rotations by the p-weighted, sign-aligned quaternions. probs [N, K], transforms [K, 4, 4]."""
     n, k = probs.shape
-    mixed = (probs @ transforms[:, :3].reshape(k, 12)).reshape(n, 3, 4)
-    means = (mixed[:, :, :3] @ g.means[:, :, None])[..., 0] + mixed[:, :, 3]
+    rows = (probs @ transforms[:, :3].reshape(k, 12)).reshape(n, 3, 4)
+    means = (rows[:, :, :3] * g.means[:, None, :]).sum(-1) + rows[:, :, 3]  # faster than a batched product of 3x3
     turns = so3.matrix_to_quat(transforms[:, :3, :3])
     turns = torch.where((turns * turns[:1]).sum(1, keepdim=True) < 0, -turns, turns)
     quats = so3.quat_multiply(so3.quat_normalize(probs @ turns), so3.quat_normalize(g.quats))
