@@ -79,17 +79,16 @@ void scatter(RasterFrame& f, const uint64_t* order, uint32_t count, uint32_t* cu
     for (uint32_t i = 0; i < count; ++i) {
         if (i + 2 * ahead < count) {
             uint32_t next = uint32_t(order[i + 2 * ahead]);
-            __builtin_prefetch(&f.pair_begin[next]);
-            __builtin_prefetch(&f.pair_count[next]);
+            __builtin_prefetch(&f.pair_range[next]);
         }
         if (i + ahead < count) {
             uint32_t next = uint32_t(order[i + ahead]);
-            __builtin_prefetch(f.pairs[next / kChunk].data + f.pair_begin[next]);
+            __builtin_prefetch(f.pairs[next / kChunk].data + f.pair_range[next].begin);
         }
-        const uint32_t g = uint32_t(order[i]), chunk = g / kChunk, begin = f.pair_begin[g];
+        const uint32_t g = uint32_t(order[i]), chunk = g / kChunk, begin = f.pair_range[g].begin, stop = f.pair_range[g].count;
         const RasterPair* pairs = f.pairs[chunk].data + begin;
         const uint32_t slot = f.chunk_slot[chunk] + begin;
-        for (uint32_t k = 0; k < f.pair_count[g]; ++k) f.entries[cursor[pairs[k].tile]++] = {pairs[k].mask, g, slot + k};
+        for (uint32_t k = 0; k < stop; ++k) f.entries[cursor[pairs[k].tile]++] = {pairs[k].mask, g, slot + k};
     }
 }
 
@@ -97,19 +96,21 @@ void scatter(RasterFrame& f, const uint64_t* order, uint32_t count, uint32_t* cu
 
 Frame::~Frame() {
     for (size_t c = 0; c < pairs_size; ++c) std::free(pairs[c].data);
-    void* all[] = {records, pair_begin, pair_count, pairs, chunk_slot, keys, ids, visible, tile_begin, tile_end, entries, slots,
-                   slot_used, sort.a, sort.b, sort.counts, tile_counts};
+    void* all[] = {records, pair_range, pairs, chunk_slot, keys, ids, visible, tile_begin, tile_end, entries, slots,
+                   slot_used, slopes_memory, sort.a, sort.b, sort.counts, tile_counts};
     for (void* p : all) std::free(p);
 }
 
-void Frame::forward(const RasterArgs& a, int threads) {
+void Frame::forward(const RasterArgs& a, bool keep, int threads) {
+    table = &kernels().raster;
     tiles_x = (a.width + kTile - 1) / kTile;
     tiles_y = (a.height + kTile - 1) / kTile;
     chunks = int((a.n + kChunk - 1) / kChunk);
     const size_t n = size_t(a.n), tiles = size_t(tiles_x) * size_t(tiles_y);
     reserve(records, records_size, n);
-    reserve(pair_begin, pair_begin_size, n);
-    reserve(pair_count, pair_count_size, n);
+    reserve(pair_range, pair_range_size, n);
+    if (keep) reserve(slopes_memory, slopes_size, (n + 16) * kSlopes);
+    slopes = keep ? slopes_memory : nullptr;
     reserve(keys, keys_size, n);
     reserve(ids, ids_size, n);
     reserve(visible, visible_size, size_t(chunks));
@@ -133,7 +134,7 @@ void Frame::forward(const RasterArgs& a, int threads) {
         Frame& f;
         const RasterKernels& k;
         size_t tiles;
-    } c{a, *this, kernels().raster, tiles};
+    } c{a, *this, *table, tiles};
     parallel_for(chunks, threads, [](int chunk, int thread, void* p) {
         const Context& c = *static_cast<const Context*>(p);
         c.k.project(c.a, c.f, chunk, c.f.tile_counts + size_t(thread) * c.tiles);
@@ -175,7 +176,7 @@ void Frame::backward(const RasterArgs& a, const RasterGrads& g, int threads) {
         const RasterGrads& g;
         Frame& f;
         const RasterKernels& k;
-    } c{a, g, *this, kernels().raster};
+    } c{a, g, *this, *table};
     parallel_for(tiles_x * tiles_y, threads, [](int tile, int, void* p) {
         const Context& c = *static_cast<const Context*>(p);
         c.k.backward(c.a, c.g, c.f, tile);

@@ -15,6 +15,7 @@ constexpr int kTile = 32;          // pixels
 constexpr int kBlocks = 64;        // per tile, row by row
 constexpr int kChunk = 512;        // Gaussians
 constexpr int kMaxFeatures = 16;
+constexpr int kSlopes = 12;        // per Gaussian and channel: 1 or 0 (not clamped, clamped), then d colour / d direction
 constexpr int kSlot = 16;          // floats of a gradient slot before the features
 constexpr float kMinAlpha = 1.0f / 255, kMaxAlpha = 0.99f, kStop = 1e-4f, kFar = 1e10f;
 
@@ -30,6 +31,11 @@ struct alignas(64) RasterRecord {
 struct RasterPair {
     uint64_t mask;
     uint32_t tile, spare;
+};
+
+// A Gaussian's pairs: `count` from `begin` on within its chunk's.
+struct RasterRange {
+    uint32_t begin, count;
 };
 
 struct RasterEntry {
@@ -66,9 +72,10 @@ struct RasterGrads {
 struct RasterFrame {
     int tiles_x, tiles_y, chunks;
     RasterRecord* records;          // n
-    uint32_t *pair_begin, *pair_count;  // n, begin within the chunk's pairs
+    RasterRange* pair_range;        // n
     RasterPairs* pairs;             // chunks
     uint32_t* chunk_slot;           // chunks + 1: slots before the chunk
+    float* slopes;                  // kSlopes n, rounded up to whole vectors and in their lanes; null where there will be no backward
     uint32_t *keys, *ids;           // n: visible Gaussians of chunk c from c * kChunk on; bits of their depth
     uint32_t* visible;              // chunks
     uint32_t* tile_begin;           // tiles + 1

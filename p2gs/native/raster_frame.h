@@ -20,14 +20,17 @@ struct Frame : RasterFrame {
     Frame& operator=(const Frame&) = delete;
 
     // Throw std::bad_alloc where memory does not suffice. Results have the same bits for any number of threads.
-    void forward(const RasterArgs& a, int threads);
+    // keep: there will be a backward pass (on the kernels of the same instruction set).
+    void forward(const RasterArgs& a, bool keep, int threads);
     void backward(const RasterArgs& a, const RasterGrads& g, int threads);
 
+    const RasterKernels* table = nullptr;
     SortBuffers sort;
+    float* slopes_memory = nullptr;
     uint32_t* tile_counts = nullptr;
-    size_t records_size = 0, pair_begin_size = 0, pair_count_size = 0, pairs_size = 0, chunk_slot_size = 0, keys_size = 0, ids_size = 0,
+    size_t records_size = 0, pair_range_size = 0, pairs_size = 0, chunk_slot_size = 0, keys_size = 0, ids_size = 0,
            visible_size = 0, tile_begin_size = 0, tile_end_size = 0, entries_size = 0, slots_size = 0, slot_used_size = 0,
-           tile_counts_size = 0;
+           tile_counts_size = 0, slopes_size = 0;
 };
 
 }  // namespace p2gs

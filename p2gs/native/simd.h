@@ -27,6 +27,10 @@ typedef VI VM;
 #define P2GS_SHUFFLE4(a, b, i, j, k, l) __builtin_shuffle(a, b, (I4){i, j, k, l})
 #endif
 
+P2GS_INLINE void prefetch_lines(const void* p, int64_t bytes) {
+    for (int64_t i = 0; i < bytes; i += 64) __builtin_prefetch(static_cast<const char*>(p) + i);
+}
+
 P2GS_INLINE VF load(const float* p) { return *reinterpret_cast<const VF*>(p); }
 P2GS_INLINE void store(float* p, VF v) { *reinterpret_cast<VF*>(p) = v; }
 P2GS_INLINE VF loadu(const float* p) {
@@ -41,13 +45,23 @@ P2GS_INLINE F4 loadu4(const float* p) {
     return v;
 }
 P2GS_INLINE void storeu4(float* p, F4 v) { memcpy(p, &v, sizeof v); }
-// The first n < W floats; the rest is zero.
+// The first n <= W floats; the rest is zero.
 P2GS_INLINE VF load_part(const float* p, int n) {
+#if defined(__AVX512F__)
+    return (VF)_mm512_maskz_loadu_ps(__mmask16((1u << n) - 1), p);
+#else
     VF v = {};
     memcpy(&v, p, 4 * n);
     return v;
+#endif
 }
-P2GS_INLINE void store_part(float* p, VF v, int n) { memcpy(p, &v, 4 * n); }
+P2GS_INLINE void store_part(float* p, VF v, int n) {
+#if defined(__AVX512F__)
+    _mm512_mask_storeu_ps(p, __mmask16((1u << n) - 1), (__m512)v);
+#else
+    memcpy(p, &v, 4 * n);
+#endif
+}
 
 #if defined(__AVX512F__)
 P2GS_INLINE VF set(float x) { return (VF)_mm512_set1_ps(x); }
@@ -61,6 +75,7 @@ P2GS_INLINE VF floor(VF a) { return (VF)_mm512_roundscale_ps((__m512)a, 9); }
 P2GS_INLINE VI to_int(VF a) { return (VI)_mm512_cvttps_epi32((__m512)a); }
 P2GS_INLINE VM ge(VF a, VF b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
 P2GS_INLINE VM gt(VF a, VF b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
+P2GS_INLINE VM lt(VF a, VF b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ); }
 P2GS_INLINE VM le(VF a, VF b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
 P2GS_INLINE VM gt(VM m, VF a, VF b) { return _mm512_mask_cmp_ps_mask(m, (__m512)a, (__m512)b, _CMP_GT_OQ); }
 P2GS_INLINE VM le(VM m, VF a, VF b) { return _mm512_mask_cmp_ps_mask(m, (__m512)a, (__m512)b, _CMP_LE_OQ); }
@@ -69,13 +84,14 @@ P2GS_INLINE VM but_not(VM a, VM b) { return VM(a & ~b); }
 P2GS_INLINE VF zero_unless(VM m, VF a) { return (VF)_mm512_maskz_mov_ps(m, (__m512)a); }
 P2GS_INLINE VF mul_if(VM m, VF a, VF b) { return (VF)_mm512_maskz_mul_ps(m, (__m512)a, (__m512)b); }
 P2GS_INLINE VF pick(VM m, VF yes, VF no) { return (VF)_mm512_mask_mov_ps((__m512)no, m, (__m512)yes); }
-// a where not m, -|b| where m
-P2GS_INLINE VF negative_if(VM m, VF a, VF b) {
-    return (VF)_mm512_castsi512_ps(
-        _mm512_mask_or_epi32((__m512i)a, m, (__m512i)b, _mm512_set1_epi32(int(0x80000000u))));
+// a where m, else -|b|
+P2GS_INLINE VF after_unless_finished(VM m, VF a, VF b) {
+    __m512i sign = _mm512_set1_epi32(int(0x80000000u));
+    return (VF)_mm512_mask_mov_epi32(_mm512_or_epi32((__m512i)b, sign), m, (__m512i)a);
 }
 P2GS_INLINE bool any(VM m) { return m != 0; }
 P2GS_INLINE unsigned bits(VM m) { return m; }
+P2GS_INLINE VM lanes_of(unsigned bits) { return VM(bits); }
 P2GS_INLINE bool any_positive(VF a) { return _mm512_movepi32_mask((__m512i)a) != 0xffff; }  // no lane's sign bit clear: false
 P2GS_INLINE VF reciprocal(VF a) {
     __m512 r = _mm512_rcp14_ps((__m512)a);
@@ -155,6 +171,7 @@ P2GS_INLINE bool any_positive(VF a) { return bits((VI)a >> 31) != 0xf; }
 P2GS_INLINE VF abs(VF a) { return (VF)((VI)a & 0x7fffffff); }
 P2GS_INLINE VM ge(VF a, VF b) { return a >= b; }
 P2GS_INLINE VM gt(VF a, VF b) { return a > b; }
+P2GS_INLINE VM lt(VF a, VF b) { return a < b; }
 P2GS_INLINE VM le(VF a, VF b) { return a <= b; }
 P2GS_INLINE VM gt(VM m, VF a, VF b) { return m & (a > b); }
 P2GS_INLINE VM le(VM m, VF a, VF b) { return m & (a <= b); }
@@ -162,22 +179,33 @@ P2GS_INLINE VM both(VM a, VM b) { return a & b; }
 P2GS_INLINE VM but_not(VM a, VM b) { return a & ~b; }
 P2GS_INLINE VF zero_unless(VM m, VF a) { return (VF)(m & (VI)a); }
 P2GS_INLINE VF mul_if(VM m, VF a, VF b) { return (VF)(m & (VI)(a * b)); }
-P2GS_INLINE VF negative_if(VM m, VF a, VF b) { return pick(m, (VF)((VI)b | int(0x80000000u)), a); }
+P2GS_INLINE VF after_unless_finished(VM m, VF a, VF b) { return pick(m, a, (VF)((VI)b | int(0x80000000u))); }
 #endif
 
-// 2^x for x in [-126, 126], relative error about 1e-7 (minimax polynomial of degree 5).
+#if !defined(__AVX512F__)
+// The inverse of bits().
+P2GS_INLINE VM lanes_of(unsigned bits) {
+    VM m;
+    for (int i = 0; i < W; ++i) m[i] = bits >> i & 1 ? -1 : 0;
+    return m;
+}
+#endif
+
+// 2^x for x in [-126, 126]. AVX-512: 2^(k/16) from a table in a register times a parabola, relative error 4.3e-7. Else a minimax
+// polynomial of degree 5 around the nearest integer, relative error 1e-7. Adding `magic` rounds x to a number that sits in the low bits.
 P2GS_INLINE VF exp2(VF x) {
 #if defined(__AVX512F__)
-    VF f = (VF)_mm512_reduce_ps((__m512)x, 9);  // x - floor(x)
-    VF p = set(0.001877576686f);
-    p = fma(p, f, set(0.008989340231f));
-    p = fma(p, f, set(0.05582631776f));
-    p = fma(p, f, set(0.2401536172f));
-    p = fma(p, f, set(0.6931530732f));
-    p = fma(p, f, set(0.9999999251f));
-    return (VF)_mm512_scalef_ps((__m512)p, (__m512)x);
+    // bits of 2^(k/16), less k << 19: what (16 x) << 19 adds to the mantissa
+    const __m512i table = _mm512_setr_epi32(0x3f800000, 0x3f7daac3, 0x3f7b95c2, 0x3f79c3d3, 0x3f7837f0, 0x3f76f532, 0x3f75fed7, 0x3f75583f,
+                                            0x3f7504f3, 0x3f7508a4, 0x3f75672a, 0x3f76248c, 0x3f7744fd, 0x3f78ccdf, 0x3f7ac0c7, 0x3f7d257d);
+    const VF magic = set(786432.0f);  // 1.5 * 2^19: steps of 1/16
+    VF t = x + magic;
+    VF f = x - (t - magic);
+    VF p = fma(fma(set(0.24022643f), f, set(0.69318772f)), f, set(1.0f));
+    __m512i e = _mm512_add_epi32(_mm512_slli_epi32((__m512i)t, 19), _mm512_permutexvar_epi32((__m512i)t, table));
+    return p * (VF)e;
 #else
-    const VF magic = set(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer that sits in the low bits
+    const VF magic = set(12582912.0f);  // 1.5 * 2^23
     VF t = x + magic;
     VF f = x - (t - magic);
     VF p = set(0.001327647207f);
@@ -265,14 +293,20 @@ P2GS_INLINE void load_columns(const float* const* rows, int n, VF* columns) {
     }
 }
 
-// The inverse, for the first `count` rows.
+// The inverse, for the first `count` rows. kStream: past the caches, where rows are aligned and the machine can.
+template <bool kStream = false>
 P2GS_INLINE void store_columns(float* const* rows, int count, int n, const VF* columns) {
     for (int c = 0; c < n; c += W) {
         VF r[W];
         for (int i = 0; i < W; ++i) r[i] = c + i < n ? columns[c + i] : VF{};
         transpose(r);
         if (c + W <= n)
-            for (int i = 0; i < count; ++i) storeu(rows[i] + c, r[i]);
+            for (int i = 0; i < count; ++i) {
+#if defined(__AVX512F__)
+                if (kStream && reinterpret_cast<uintptr_t>(rows[i]) % 64 == 0) { _mm512_stream_ps(rows[i] + c, (__m512)r[i]); continue; }
+#endif
+                storeu(rows[i] + c, r[i]);
+            }
         else
             for (int i = 0; i < count; ++i) store_part(rows[i] + c, r[i], n - c);
     }
@@ -296,4 +330,82 @@ P2GS_INLINE F4 sum4(VF a, VF b, VF c, VF d) {
     transpose(r);
     return (r[0] + r[1]) + (r[2] + r[3]);
 #endif
+}
+
+#if defined(__AVX512F__)
+P2GS_INLINE VF select2(VF a, VF b, __m512i lanes) { return (VF)_mm512_permutex2var_ps((__m512)a, lanes, (__m512)b); }
+#endif
+
+// out[k] = element k of W consecutive rows of K floats (K = 3 or 4). Of the rows only `count` exist; the others repeat the first.
+template <int K>
+P2GS_INLINE void load_rows(const float* p, int count, VF* out) {
+    alignas(64) float copy[K * W];
+    if (count < W) {
+        for (int i = 0; i < W; ++i) memcpy(copy + K * i, p + (i < count ? K * i : 0), 4 * K);
+        p = copy;
+    }
+#if defined(__AVX512F__)
+    const __m512i lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    if (K == 3) {
+        VF a = loadu(p), b = loadu(p + 16), c = loadu(p + 32);
+        for (int k = 0; k < 3; ++k) {  // element 3 i + k: in a up to 15, in b up to 31
+            __m512i at = _mm512_add_epi32(_mm512_mullo_epi32(lane, _mm512_set1_epi32(3)), _mm512_set1_epi32(k));
+            VF ab = select2(a, b, at);
+            __mmask16 late = _mm512_cmpgt_epi32_mask(at, _mm512_set1_epi32(31));
+            out[k] = (VF)_mm512_mask_permutexvar_ps((__m512)ab, late, at, (__m512)c);
+        }
+    } else {
+        VF a = loadu(p), b = loadu(p + 16), c = loadu(p + 32), d = loadu(p + 48);
+        const __m512i even = _mm512_setr_epi32(0, 4, 8, 12, 16, 20, 24, 28, 1, 5, 9, 13, 17, 21, 25, 29);
+        const __m512i odd = _mm512_add_epi32(even, _mm512_set1_epi32(2));
+        VF ab = select2(a, b, even), cd = select2(c, d, even);
+        out[0] = (VF)_mm512_shuffle_f32x4((__m512)ab, (__m512)cd, 0x44);
+        out[1] = (VF)_mm512_shuffle_f32x4((__m512)ab, (__m512)cd, 0xee);
+        ab = select2(a, b, odd), cd = select2(c, d, odd);
+        out[2] = (VF)_mm512_shuffle_f32x4((__m512)ab, (__m512)cd, 0x44);
+        out[3] = (VF)_mm512_shuffle_f32x4((__m512)ab, (__m512)cd, 0xee);
+    }
+#else
+    alignas(64) float columns[K][W];
+    for (int i = 0; i < W; ++i)
+        for (int k = 0; k < K; ++k) columns[k][i] = p[K * i + k];
+    for (int k = 0; k < K; ++k) out[k] = load(columns[k]);
+#endif
+}
+
+// The inverse: the first `count` rows.
+template <int K>
+P2GS_INLINE void store_rows(float* p, int count, const VF* in) {
+    alignas(64) float copy[K * W];
+    float* to = count < W ? copy : p;
+#if defined(__AVX512F__)
+    if (K == 3) {
+        alignas(64) static const int32_t xy[48] = {0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5, 21, 0, 6, 22, 0, 7, 23, 0,
+                                                   8, 24, 0, 9, 25, 0, 10, 26, 0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0};
+        alignas(64) static const int32_t z[48] = {0, 0, 0, 0, 0, 1, 0, 0, 2, 0, 0, 3, 0, 0, 4, 0, 0, 5, 0, 0, 6, 0, 0, 7,
+                                                  0, 0, 8, 0, 0, 9, 0, 0, 10, 0, 0, 11, 0, 0, 12, 0, 0, 13, 0, 0, 14, 0, 0, 15};
+        const __mmask16 is_z[3] = {0x4924, 0x2492, 0x9249};
+        for (int j = 0; j < 3; ++j) {
+            VF v = select2(in[0], in[1], _mm512_load_si512(xy + 16 * j));
+            storeu(to + 16 * j, (VF)_mm512_mask_permutexvar_ps((__m512)v, is_z[j], _mm512_load_si512(z + 16 * j), (__m512)in[2]));
+        }
+    } else {
+        __m512 a = _mm512_unpacklo_ps((__m512)in[0], (__m512)in[1]), b = _mm512_unpackhi_ps((__m512)in[0], (__m512)in[1]);
+        __m512 c = _mm512_unpacklo_ps((__m512)in[2], (__m512)in[3]), d = _mm512_unpackhi_ps((__m512)in[2], (__m512)in[3]);
+        __m512 q[4] = {_mm512_shuffle_ps(a, c, 0x44), _mm512_shuffle_ps(a, c, 0xee), _mm512_shuffle_ps(b, d, 0x44),
+                       _mm512_shuffle_ps(b, d, 0xee)};  // q[i]: rows i, 4 + i, 8 + i, 12 + i
+        __m512 e = _mm512_shuffle_f32x4(q[0], q[1], 0x44), f = _mm512_shuffle_f32x4(q[2], q[3], 0x44);
+        __m512 g = _mm512_shuffle_f32x4(q[0], q[1], 0xee), h = _mm512_shuffle_f32x4(q[2], q[3], 0xee);
+        storeu(to, (VF)_mm512_shuffle_f32x4(e, f, 0x88));
+        storeu(to + 16, (VF)_mm512_shuffle_f32x4(e, f, 0xdd));
+        storeu(to + 32, (VF)_mm512_shuffle_f32x4(g, h, 0x88));
+        storeu(to + 48, (VF)_mm512_shuffle_f32x4(g, h, 0xdd));
+    }
+#else
+    alignas(64) float columns[K][W];
+    for (int k = 0; k < K; ++k) store(columns[k], in[k]);
+    for (int i = 0; i < W; ++i)
+        for (int k = 0; k < K; ++k) to[K * i + k] = columns[k][i];
+#endif
+    if (count < W) memcpy(p, copy, 4 * K * count);
 }

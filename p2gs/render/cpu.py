@@ -24,7 +24,7 @@ def _address(t: Optional[Tensor]) -> int:
     return 0 if t is None else t.data_ptr()
 
 
-def _forward(a: RenderInputs, means, quats, scales, opacities, sh, features, background):
+def _forward(a: RenderInputs, keep: bool, means, quats, scales, opacities, sh, features, background):
     """Renders; returns the native view (needed for backward) and (colour, alpha, depth, depth_sq, features, median, radii)."""
     h, w, n = a.height, a.width, means.shape[0]
     colour, alpha, depth = torch.empty(h, w, 3), torch.empty(h, w), torch.empty(h, w)
@@ -39,7 +39,7 @@ def _forward(a: RenderInputs, means, quats, scales, opacities, sh, features, bac
     outputs = (colour, alpha, depth, depth_sq, median, features_out, radii)
     view.forward(
         [_address(t) for t in (*inputs, *outputs)], n, sh.shape[1], a.sh_degree, channels, a.viewmat.reshape(-1).tolist(),
-        [fx, fy, cx, cy], w, h, a.near, a.eps2d, a.depth_ref, background is not None and background.dim() == 3, num_threads(),
+        [fx, fy, cx, cy], w, h, a.near, a.eps2d, a.depth_ref, background is not None and background.dim() == 3, keep, num_threads(),
     )  # fmt: skip
     return view, (colour, alpha, depth, depth_sq, features_out, median, radii)
 
@@ -48,7 +48,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, a: RenderInputs, abs_grad, means, quats, scales, opacities, sh, features, background):
         ctx.set_materialize_grads(False)
-        view, out = _forward(a, means, quats, scales, opacities, sh, features, background)
+        view, out = _forward(a, True, means, quats, scales, opacities, sh, features, background)
         ctx.view, ctx.abs_grad = view, abs_grad
         # the kernels read these again: saving them lets autograd notice when somebody has written into one
         ctx.save_for_backward(means, quats, scales, opacities, sh, features, background, *out[:5])
@@ -87,6 +87,6 @@ def rasterize_cpu(a: RenderInputs) -> RenderOutput:
     if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors):
         out = _Rasterize.apply(a, abs_grad, *tensors)
     else:
-        out = _forward(a, *tensors)[1]
+        out = _forward(a, False, *tensors)[1]
     colour, alpha, depth, depth_sq, features, median, radii = out
     return RenderOutput(colour, alpha, depth, depth_sq, a.depth_ref, median, features, radii, abs_grad)
