@@ -134,9 +134,11 @@ def _project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray
 
 
 def _hidden(uv, z, surface, margin) -> np.ndarray:
+    """[n] bool: the point lies behind the surface; a majority over neighbours, so that a stroke along a surface does not flicker."""
     h, w = surface.shape
     u, v = (np.clip(np.round(uv[:, i]).astype(int), 0, n - 1) for i, n in ((0, w), (1, h)))
-    return z > surface[v, u] + margin
+    behind = (z > surface[v, u] + margin).astype(float)
+    return np.convolve(np.pad(behind, 3, mode="edge"), np.full(7, 1 / 7), mode="valid") > 0.5
 
 
 def _apply(T: Tensor, x: Tensor) -> Tensor:
