@@ -101,12 +101,13 @@ def parser(prog: str = "p2gs") -> Parser:
     synth.add_argument("--format", choices=("artgs", "dta", "paris"), default="artgs", help="layout (default artgs)")
     synth.add_argument("--no_depth", action="store_true", help="write no depth maps")
 
-    ready = actions.add_parser("prepare", help="check a downloaded benchmark", description="Check a downloaded benchmark against the object lists.")
+    about = "Check a downloaded benchmark against the object lists."
+    ready = actions.add_parser("prepare", help="check a downloaded benchmark", description=about)
     ready.add_argument("root", metavar="DIR", help="the downloaded tree")
-    ready.add_argument("--objects", nargs="+", default=["all"], metavar="NAME", help="paris, dta_multi, artgs_multi or object ids (default all)")
+    ready.add_argument("--objects", nargs="+", default=["all"], metavar="NAME", help="benchmarks or object ids (default all)")
 
     bench = add("bench", "run objects x settings x seeds, or time the rasterizers", epilog=BENCH_HELP)
-    bench.add_argument("-c", "--config", **several, metavar="FILE", help="YAML files of benches (bench/paris.yaml), later ones laid on earlier ones")
+    bench.add_argument("-c", "--config", **several, metavar="FILE", help="YAML files of benches, such as bench/paris.yaml")
     bench.add_argument("--root", metavar="DIR", help="the tree that holds the objects")
     bench.add_argument("--out", metavar="DIR", help="result folder (default runs/bench/<name>)")
     bench.add_argument("--objects", nargs="+", metavar="NAME", help="these instead: benchmarks, object ids or scene folders below --root")

@@ -1,7 +1,7 @@
 """One run of a bench: ``p2gs fit``, ``export``, ``test`` as processes of their own, and what became of them.
 
-RUN/cell.json holds {key, status: running|stopped|done|failed, seconds, error, object, setting, seed, parts, words, host}; RUN/bench.log what the
-commands said. A run is done when it has a metrics.json that was not made from another config.
+RUN/cell.json holds {key, status: running|stopped|done|failed, seconds, error, object, setting, seed, parts, words, host}, RUN/bench.log
+what the commands said. A run is done when it has a metrics.json that was not made from another config.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from typing import Callable, Iterator, Optional, Sequence
 
 from p2gs.bench.published import CHAMFER, METRICS, PaperTable, footnotes
 from p2gs.bench.results import Results, Run
-from p2gs.bench.stats import Sample, sample
+from p2gs.bench.stats import PUBLISHED_RUNS, Sample, sample
 
 OURS = "p2gs"
 
@@ -94,8 +94,10 @@ class Filled:
             if note.applies(self.table.name, row, object, metric):
                 notes.append(i)
                 self.used[i] = note.text
-        digits = len(p.text.partition(".")[2]) - METRICS[metric].digits if p.value is not None else 0
-        return Entry(metric, object, p.value, p.std, 3 if p.std is not None else 1, "" if p.value is not None else p.text, notes=notes, extra_digits=digits)
+        if p.value is None:
+            return Entry(metric, object, text=p.text, notes=notes)
+        digits = len(p.text.partition(".")[2]) - METRICS[metric].digits
+        return Entry(metric, object, p.value, p.std, 1 if p.std is None else PUBLISHED_RUNS, notes=notes, extra_digits=digits)
 
     def mine(self, setting: str, object: str, metric: str) -> Entry:
         return summarize(self.runs.get((setting, object), []), object, metric)
@@ -221,7 +223,8 @@ def _groups(f: Filled, objects: Sequence[str]):
         if "average" in objects:
             rows.append(Row([group, "Average, paper"], [_keyed(f.paper(group, "average", m), group) for m in metrics], "paper"))
         if ours:
-            rows.append(Row([group, f"Average, {OURS}"], [average([e[i] for e in ours], m, f"average {group}") for i, m in enumerate(metrics)], "ours"))
+            means = [average([e[i] for e in ours], m, f"average {group}") for i, m in enumerate(metrics)]
+            rows.append(Row([group, f"Average, {OURS}"], means, "ours"))
     return ["Category", "Object"], [METRICS[m].title for m in metrics], rows
 
 
@@ -241,7 +244,8 @@ def _settings(f: Filled, objects: Sequence[str]):
                 entries = [f.mine(s, o, m) if s else Entry(m, o) for s in mapped.values()]
                 rows.append(Row([o, METRICS[m].title, OURS], entries, "ours"))
                 if f.has_floor([o], m):
-                    rows.append(Row([o, METRICS[m].title, "sampling floor"], [f.floor(o, m) if s else Entry(m, o) for s in mapped.values()], "floor"))
+                    floors = [f.floor(o, m) if s else Entry(m, o) for s in mapped.values()]
+                    rows.append(Row([o, METRICS[m].title, "sampling floor"], floors, "floor"))
     return ["Object", "Metric", "Source"], f.table.rows, rows
 
 

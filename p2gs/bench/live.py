@@ -71,8 +71,10 @@ class Display:
 
     def left(self) -> Optional[float]:
         """Seconds to go: the runs to come at the mean length of those that ended, less what the running ones have behind them."""
-        times = self.seconds or [s for c in self.bench.cells if (s := read_record(c.run).get("seconds", 0.0)) and self.known[c.name] == "done"]
-        if not times:
+        times = self.seconds
+        if not times:  # nothing yet in this sitting: what the records say
+            times = [read_record(c.run).get("seconds", 0.0) for c in self.bench.cells if self.known[c.name] == "done"]
+        if not any(times):
             return None
         mean, now = sum(times) / len(times), time.monotonic()
         todo = sum(s == "todo" for s in self.known.values()) * mean
@@ -101,7 +103,8 @@ class Display:
         for scene in self.bench.scenes:
             table.add_row(scene.name, *(signs.get((scene.name, setting), Text()) for setting in self.bench.settings))
         left = self.left()
-        lines = [Text(f"{self.finished()}/{len(self.known)} runs, " + ("time left not known yet" if left is None else f"about {duration(left)} left"))]
+        rest = "time left not known yet" if left is None else f"about {duration(left)} left"
+        lines = [Text(f"{self.finished()}/{len(self.known)} runs, {rest}")]
         lines += [Text(f"{name}: {error}", "red", no_wrap=True, overflow="ellipsis") for name, error in self.errors[-5:]]
         return Group(table, *lines)
 

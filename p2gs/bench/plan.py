@@ -1,15 +1,15 @@
 """What a bench runs: objects x settings x seeds, read from a YAML file such as ``configs/bench/paris.yaml``.
 
-    name: paris                        # result folder runs/bench/<name> unless out says otherwise
-    tables: [main_result]              # tables of the paper to fill (names of p2gs/bench/data/published/*.csv)
-    root: data                         # the tree that holds the objects' folders; --root DIR
-    objects: [paris]                   # benchmarks, object ids or names of scene folders below root; null: every scene folder
-    config: [preset/cpu.yaml]          # laid under every run
-    settings:                          # name -> what it changes
-      full: {}
-      no_repel: {config: [ablation/no_repel.yaml]}
-      k_plus_2: {num_parts: gt+2}      # relative to the object's true number of parts
-    seeds: [0, 1, 2]
+name: paris                        # result folder runs/bench/<name> unless out says otherwise
+tables: [main_result]              # tables of the paper to fill (names of p2gs/bench/data/published/*.csv)
+root: data                         # the tree that holds the objects' folders; --root DIR
+objects: [paris]                   # benchmarks, object ids or names of scene folders below root; null: every scene folder
+config: [preset/cpu.yaml]          # laid under every run
+settings:                          # name -> what it changes
+  full: {}
+  no_repel: {config: [ablation/no_repel.yaml]}
+  k_plus_2: {num_parts: gt+2}      # relative to the object's true number of parts
+seeds: [0, 1, 2]
 """
 
 from __future__ import annotations
@@ -217,7 +217,10 @@ class Bench:
 
 
 def resolve_parts(wanted: Optional[Union[int, str]], scene: Scene) -> Optional[str]:
-    """``gt+2`` -> "6" for an object of four parts; never below 2. Raises UserError where the truth is not known or the text means nothing."""
+    """``gt+2`` -> "6" for an object of four parts; never below 2.
+
+    Raises UserError where the truth is not known or the text means nothing.
+    """
     if wanted is None or wanted == "auto" or isinstance(wanted, int) or str(wanted).isdigit():
         return None if wanted is None else str(wanted)
     match = GT.fullmatch(str(wanted).strip().lower())

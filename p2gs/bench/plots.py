@@ -8,7 +8,10 @@ from typing import Sequence
 from p2gs.bench.grids import Entry, Grid
 from p2gs.bench.published import METRICS
 
-COLOURS = {"paper": ["#c9ccd1", "#a4a9b3", "#7f8794", "#5c6575", "#3c4454"], "ours": ["#e8602c", "#f29e4c", "#2a9d8f", "#8ac926", "#6a4c93"]}
+COLOURS = {
+    "paper": ["#c9ccd1", "#a4a9b3", "#7f8794", "#5c6575", "#3c4454"],
+    "ours": ["#e8602c", "#f29e4c", "#2a9d8f", "#8ac926", "#6a4c93", "#1982c4", "#ff595e", "#b5838d"],
+}
 
 
 def plot(path: Path, grids: Sequence[Grid]) -> bool:

@@ -1,4 +1,4 @@
-"""The paper's tables as data: every number with its table, row, object and metric, and the footnotes on those that contradict each other."""
+"""The paper's tables as data: every number with its table, row, object and metric; footnotes on those that contradict each other."""
 
 from __future__ import annotations
 

@@ -47,7 +47,8 @@ def write_tables(folder: Path | str, names: Optional[list[str]] = None, out: Opt
     tables = [paper_table(name) for name in (names if names is not None else results.tables)]
     for table in tables:
         if not set(table.ours) & set(results.settings):
-            raise UserError(f"{table.name}: its rows are the settings {', '.join(table.ours)}; this bench has {', '.join(results.settings)}")
+            rows, have = ", ".join(table.ours), ", ".join(results.settings)
+            raise UserError(f"{table.name}: its rows are the settings {rows}; this bench has {have}")
     target.mkdir(parents=True, exist_ok=True)
     files, sections, tests = [], [], []
     for name, grids in [("summary", [summary(results)]), *((t.name, fill(t, results)) for t in tables)]:
@@ -126,7 +127,7 @@ def between_settings(table: PaperTable, results: Results) -> Iterator[Test]:
 def write_tests(path: Path, tests: list[Test]) -> Path:
     with open(path, "w", newline="", encoding="utf-8") as file:
         out = csv.writer(file, lineterminator="\n")
-        out.writerow(["table", "object", "metric", "a", "b", "mean_a", "std_a", "n_a", "mean_b", "std_b", "n_b", "t", "degrees", "p", "verdict"])
+        out.writerow("table object metric a b mean_a std_a n_a mean_b std_b n_b t degrees p verdict".split())
         for x in tests:
             a, b, r = x.sample_a, x.sample_b, x.result
             out.writerow([x.table, x.object, x.metric, x.a, x.b, a.mean, a.std, a.n, b.mean, b.std, b.n, r.t, r.degrees, r.p, x.verdict])
@@ -182,8 +183,9 @@ def notes(results: Results, plotted: bool) -> str:
     lines = [
         "## Notes",
         "",
-        "- Mean ± standard deviation over seeds. Ang Err in degrees; Pos Err in tenths of the scene's unit, a prismatic joint counting as 0 (as in the",
-        "  published tables); Motion Err in degrees or units, averaged over both kinds of joint; Chamfer distances squared, both directions, x1000.",
+        "- Mean ± standard deviation over seeds. Ang Err in degrees; Pos Err in tenths of the scene's unit, a prismatic joint",
+        "  counting as 0 (as in the published tables); Motion Err in degrees or units, averaged over both kinds of joint;",
+        "  Chamfer distances squared, both directions, x1000.",
         "- F k/n: k of n joints (over all seeds) were not found or have the wrong type; the number beside it is the mean of the others.",
         "- Best of each object and metric in bold, as printed; numbers beside an F do not compete.",
         "- Sampling floor: what the true surface scores against another sampling of itself; differences below it mean nothing.",

@@ -24,7 +24,8 @@ class SlurmExecutor:
         self.slots = 1 if o.cluster == "debug" else o.jobs
         self.cpus, self.work = options.threads or o.cpus, work
         self.executor = submitit.AutoExecutor(folder=options.folder / "slurm" / "%j", cluster=o.cluster)
-        resources = {"timeout_min": o.minutes, "cpus_per_task": o.cpus, "gpus_per_node": o.gpus, "mem_gb": o.memory_gb, "name": options.name}
+        resources = {"timeout_min": o.minutes, "cpus_per_task": o.cpus, "gpus_per_node": o.gpus, "mem_gb": o.memory_gb}
+        resources["name"] = options.name
         if o.cluster == "slurm":
             resources["slurm_array_parallelism"] = o.jobs
         try:

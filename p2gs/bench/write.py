@@ -108,5 +108,5 @@ def write_csv(path: Path, grids: Sequence[Grid]) -> None:
             for row in grid.rows:
                 for e in row.entries:
                     if e.mean is not None or (e.text and e.object):
-                        values = [e.mean, e.std, e.n, e.text, *e.lost, int(e.best)]
-                        out.writerow([grid.name, " / ".join(row.labels), row.kind, e.object, e.metric, *("" if v is None else v for v in values)])
+                        values = [" / ".join(row.labels), row.kind, e.object, e.metric, e.mean, e.std, e.n, e.text, *e.lost, int(e.best)]
+                        out.writerow([grid.name, *("" if v is None else v for v in values)])

@@ -43,7 +43,12 @@ def layout(phase_name: str, losses: dict[str, Any]) -> dict:
         charts.setdefault(family(loss), ["Multiline", []])[1].append(f"^{phase_name}/loss/{name}$")
     out = {f"{phase_name}: losses": charts}
     if phase_name == "articulation":
-        tags = {"turn [deg]": r"joint_\d+/degrees", "slide": r"joint_\d+/slide", "mass of the parts": r"part_mass/\d+", "joint errors": r"error/.*"}
+        tags = {
+            "turn [deg]": r"joint_\d+/degrees",
+            "slide": r"joint_\d+/slide",
+            "mass of the parts": r"part_mass/\d+",
+            "joint errors": r"error/.*",
+        }
         out[f"{phase_name}: joints"] = {chart: ["Multiline", [f"^{phase_name}/{tag}$"]] for chart, tag in tags.items()}
     return out
 

@@ -53,7 +53,8 @@ def benchmarks() -> dict[str, tuple[BenchmarkObject, ...]]:
     tree = yaml.safe_load((Path(__file__).parent / "objects.yaml").read_text(encoding="utf-8"))
     return {
         name: tuple(
-            BenchmarkObject(o["id"], name, tuple(TYPES[j] for j in o["joints"]), o["column"], o.get("subset", "sapien")) for o in entry["objects"]
+            BenchmarkObject(o["id"], name, tuple(TYPES[j] for j in o["joints"]), o["column"], o.get("subset", "sapien"))
+            for o in entry["objects"]
         )
         for name, entry in tree.items()
     }
@@ -93,9 +94,9 @@ def scene_folders(root: Path) -> list[Path]:
 
 
 def find_objects(root: Path | str, objects: Iterable[BenchmarkObject]) -> dict[str, Location]:
-    """Where each object lies in a downloaded tree: a scene folder of its name, or a source below a ``load`` folder. Missing ones are left out.
+    """Where each object lies in a downloaded tree: a scene folder of its name, or a source below a ``load`` folder.
 
-    Of an object that is there several times the ArtGS layout is taken (it has depth), then DTA's, then PARIS's.
+    Missing ones are left out. Of an object that is there several times the ArtGS layout is taken (it has depth), then DTA's, then PARIS's.
     """
     from p2gs.data.layouts import detect_format
     from p2gs.data.paris import sources

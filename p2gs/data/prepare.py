@@ -78,7 +78,9 @@ def check_truth(found: Prepared) -> None:
         found.problems.append(str(err))
         return
     if truth is None:
-        found.problems.append("there is no ground truth (gt/trans.json, or data/<source>/textured_objs/trans.json), so results cannot be scored")
+        found.problems.append(
+            "there is no ground truth (gt/trans.json, or data/<source>/textured_objs/trans.json), so results cannot be scored"
+        )
         return
     kinds = [j.type for j in truth.joints]
     if Counter(kinds) != Counter(o.joints):

@@ -28,7 +28,7 @@ def joint(kind: str, motion: float = 1.0) -> dict:
     return {"type": kind, "axis": {"o": [0, 0, 0], "d": [0, 0, 1]}, kind: {"l": 0.0, "r": motion}}
 
 
-def write_scene(folder: Path, joints: list[str]) -> Path:
+def _write_scene(folder: Path, joints: list[str]) -> Path:
     """A folder that looks like a scene in the ArtGS layout, with ground truth."""
     (folder / "gt").mkdir(parents=True)
     (folder / "transforms_train_start.json").write_text("{}")
@@ -37,7 +37,13 @@ def write_scene(folder: Path, joints: list[str]) -> Path:
 
 
 @pytest.fixture
-def tree(tmp_path) -> Path:
+def write_scene():
+    """``write_scene(folder, ["rotate", "translate"])``."""
+    return _write_scene
+
+
+@pytest.fixture
+def tree(tmp_path, write_scene) -> Path:
     """Two scenes, cabinet (three parts) and laptop (two)."""
     write_scene(tmp_path / "scenes" / "cabinet", ["rotate", "translate"])
     write_scene(tmp_path / "scenes" / "laptop", ["rotate"])

@@ -1,4 +1,7 @@
-"""Stands in for p2gs in the tests of the bench. FAKE_P2GS_FAIL: text in the run's path that makes fit fail.  FAKE_P2GS_SLEEP: seconds of a fit."""
+"""Stands in for p2gs in the tests of the bench.
+
+FAKE_P2GS_FAIL: text in the run's path that makes fit fail.  FAKE_P2GS_SLEEP: seconds of a fit.
+"""
 
 import json
 import os

@@ -15,9 +15,11 @@ FILES = sorted(p.name for p in (CONFIGS / "bench").glob("*.yaml"))
 
 
 def test_the_matrix_is_objects_times_settings_times_seeds(bench_file, tree, tmp_path):
-    text = "settings: {full: {}, over: {num_parts: gt+2, config: [ablation/no_repel.yaml], set: {phases.articulation.steps: 7}}}\nseeds: [0, 3]\n"
+    over = "{num_parts: gt+2, config: [ablation/no_repel.yaml], set: {phases.articulation.steps: 7}}"
+    text = f"settings: {{full: {{}}, over: {over}}}\nseeds: [0, 3]\n"
     bench = read_bench([bench_file(text)], ["--phases.single_state.steps", "5"])
-    assert [(c.setting, c.object, c.seed) for c in bench.cells] == [(s, o, k) for s in ("full", "over") for o in ("cabinet", "laptop") for k in (0, 3)]
+    expected = [(s, o, k) for s in ("full", "over") for o in ("cabinet", "laptop") for k in (0, 3)]
+    assert [(c.setting, c.object, c.seed) for c in bench.cells] == expected
     last = bench.cells[-1]
     assert last.run == str(tmp_path / "out" / "runs" / "over" / "laptop" / "seed3") and last.parts == 2
     words = "-c preset/cpu.yaml -c ablation/no_repel.yaml --data.root {} --data.format artgs --seed 3 --num_parts 4"
@@ -43,7 +45,8 @@ def test_the_key_follows_what_decides_the_result(bench_file, tmp_path):
 
 def test_parts_relative_to_the_truth():
     four = Scene("x", "x", "/x", parts=4)
-    assert [resolve_parts(w, four) for w in ("gt", "gt+2", "GT - 1", "gt-9", 6, "5", "auto", None)] == ["4", "6", "3", "2", "6", "5", "auto", None]
+    cases = {"gt": "4", "gt+2": "6", "GT - 1": "3", "gt-9": "2", 6: "6", "5": "5", "auto": "auto", None: None}
+    assert {wanted: resolve_parts(wanted, four) for wanted in cases} == cases
     with pytest.raises(UserError, match="no ground truth"):
         resolve_parts("gt", Scene("x", "x", "/x"))
     with pytest.raises(UserError, match="gt or gt\\+N, got 'many'"):
@@ -55,7 +58,11 @@ def test_parts_relative_to_the_truth():
     [
         ("sedes: [1]", [], "no option 'sedes' \\(did you mean 'seeds'\\?\\)"),
         ("settings: {full: {konfig: [x]}}", [], "settings.full: no option 'konfig' \\(did you mean 'config'\\?\\)"),
-        ("settings: {full: {config: [ablation/no_repell.yaml]}}", [], "'ablation/no_repell.yaml' is not there \\(did you mean 'ablation/no_repel.yaml'"),
+        (
+            "settings: {full: {config: [ablation/no_repell]}}",
+            [],
+            "'ablation/no_repell' is not there \\(did you mean 'ablation/no_repel.yaml'",
+        ),
         ("settings: {a/b: {}}", [], "'a/b' names a folder"),
         ("settings: {full: 3}", [], "settings.full: expected options"),
         ("objects: [cabinett]", [], "no scene 'cabinett', and no benchmark has \\(did you mean 'cabinet'\\?\\)"),

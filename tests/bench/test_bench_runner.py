@@ -17,6 +17,12 @@ from p2gs.bench.live import Display
 from p2gs.bench.plan import read_bench
 from p2gs.bench.runner import run_bench
 
+BENCH = """
+from p2gs.bench.plan import read_bench
+from p2gs.bench.runner import run_bench
+
+run_bench(read_bench([{path!r}]), program={program!r})
+"""
 ONE = "settings: {full: {}}\nseeds: [0]\n"
 
 
@@ -35,7 +41,8 @@ def test_every_run_is_fit_exported_and_tested_once(bench_file, program):
     assert [len(program.calls(command)) for command in ("fit", "export", "test")] == [8, 8, 8]
     cell = bench.cells[-1]
     record = read_record(cell.run)
-    assert (record["object"], record["setting"], record["seed"], record["status"]) == ("laptop", "no_repel", 1, "done") and record["seconds"] > 0
+    assert (record["object"], record["setting"], record["seed"], record["status"]) == ("laptop", "no_repel", 1, "done")
+    assert record["seconds"] > 0
     assert f"$ p2gs fit {' '.join(cell.words)}" in (Path(cell.run) / "bench.log").read_text()
     assert "8 of 8 runs done" in text and "[8/8] laptop no_repel seed 1: done" in text and " left\n" in text
     counts, text = run(read_bench([bench_file()]), program)
@@ -48,7 +55,9 @@ def test_a_run_takes_over_finished_stages_of_the_settings_before(bench_file, pro
     first = {c.object: c.run for c in bench.cells if c.setting == "full"}
     for cell in bench.cells:
         assert (Path(cell.run) / "checkpoints" / "single_state_0.pt").read_text() == f"made in {first[cell.object]}"
-    alone = read_bench([bench_file("settings: {full: {}, no_repel: {}}\nseeds: [0]\nreuse: false\n")], ["--out", str(bench.options.folder) + "2"])
+    alone = read_bench(
+        [bench_file("settings: {full: {}, no_repel: {}}\nseeds: [0]\nreuse: false\n")], ["--out", str(bench.options.folder) + "2"]
+    )
     run(alone, program)
     for cell in alone.cells:
         assert (Path(cell.run) / "checkpoints" / "single_state_0.pt").read_text() == f"made in {cell.run}"
@@ -104,7 +113,7 @@ def test_a_killed_bench_loses_at_most_the_runs_that_were_running(bench_file, pro
     """SIGKILL, so that nothing can be tidied up: even the orphaned run is waited for, not joined."""
     monkeypatch.setenv("FAKE_P2GS_SLEEP", "0.7")
     path = bench_file("settings: {full: {}}\nseeds: [0, 1, 2]\nprocesses: 2\n")
-    code = f"from p2gs.bench.plan import read_bench\nfrom p2gs.bench.runner import run_bench\nrun_bench(read_bench([{path!r}]), program={tuple(program)!r})"
+    code = BENCH.format(path=path, program=tuple(program))
     child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
     bench = read_bench([path])
     until = time.monotonic() + 60
@@ -124,7 +133,7 @@ def test_a_killed_bench_loses_at_most_the_runs_that_were_running(bench_file, pro
 def test_a_terminated_bench_ends_its_runs(bench_file, program, monkeypatch):
     monkeypatch.setenv("FAKE_P2GS_SLEEP", "30")
     path = bench_file(ONE)
-    code = f"from p2gs.bench.plan import read_bench\nfrom p2gs.bench.runner import run_bench\nrun_bench(read_bench([{path!r}]), program={tuple(program)!r})"
+    code = BENCH.format(path=path, program=tuple(program))
     child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     cell = read_bench([path]).cells[0]
     until = time.monotonic() + 60
