@@ -10,7 +10,7 @@ import numpy as np
 
 from p2gs.export.convex import Piece, decompose, intersect
 from p2gs.export.mesh import read_meshes, write_meshes
-from p2gs.export.tsdf import Mesh
+from p2gs.export.tsdf import Mesh, vertex_normals
 from p2gs.export.twin_json import load_twin
 from p2gs.types import Joint, UserError
 
@@ -226,8 +226,15 @@ def simplify(mesh: Mesh, max_faces: int) -> Mesh:
 
 
 def cluster(mesh: Mesh, cell: float) -> Mesh:
-    """Vertices merged by cubic cell (mean position and colour); triangles that collapse or double go."""
-    key = np.floor((mesh.vertices - mesh.vertices.min(0)) / cell).astype(np.int64)
+    """Vertices merged by cubic cell (mean position and colour); triangles that collapse or double go.
+
+    Vertices that look in different directions stay apart, so that the two sides of a thin wall do not become one.
+    """
+    normal = vertex_normals(mesh.vertices, mesh.faces)
+    rows = np.arange(len(normal))
+    side = np.abs(normal).argmax(1)
+    side = 2 * side + (normal[rows, side] > 0)
+    key = np.c_[np.floor((mesh.vertices - mesh.vertices.min(0)) / cell).astype(np.int64), side]
     _, label = np.unique(key, axis=0, return_inverse=True)
     label = label.reshape(-1)
     count = np.bincount(label).astype(float)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from p2gs.export.asset import Asset, Hinge, Link
+from p2gs.export.tsdf import vertex_normals
 from p2gs.ops.palette import part_colour
 
 SECONDS = 4.0  # start -> end -> start
@@ -85,17 +86,6 @@ def glb_bytes(asset: Asset) -> bytes:
     block = bytes(buffer.data) + b"\0" * (-len(buffer.data) % 4)
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(block), 0x004E4942) + block
     return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted, [V, 3] unit."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normal, face = np.zeros_like(vertices), np.cross(b - a, c - a)
-    for i in range(3):
-        for axis in range(3):
-            normal[:, axis] += np.bincount(faces[:, i], face[:, axis], len(vertices))
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return np.where(length > 0, normal / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
 
 
 def _mesh(buffer: Buffer, link: Link) -> dict:

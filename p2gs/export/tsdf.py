@@ -140,11 +140,12 @@ def _integrate(x: Tensor, views, maps, matrices, trunc: float, behind: float) ->
         w = torch.where(free, FREE_WEIGHT, near)
         weight += w
         total += w * (d / trunc).clamp_(-1, 1).masked_fill_(free, 1.0)
-        near *= d < trunc
+        # colour from sightings right at the voxel: those of a thin wall's other side are only a few voxels away
+        near *= (d < trunc) * torch.exp(-((4 * d / trunc) ** 2)).clamp_min_(1e-4)
         tint[:, 0] += near
         tint[:, 1:] += near[:, None] * row[:, 3:]
     seen = tint[:, 0]
-    return total / weight, torch.where(seen > 1e-6, seen, torch.zeros_like(seen)), tint[:, 1:] / seen[:, None]
+    return total / weight, torch.where(seen > 1e-7, seen, torch.zeros_like(seen)), tint[:, 1:] / seen[:, None]
 
 
 @dataclass
@@ -205,6 +206,17 @@ class ActiveGrid:
         rgb = rgb[:, :3] / np.maximum(rgb[:, 3:], 1e-6)
         world = self.origin.numpy() + vertices.astype(np.float64) * self.voxel
         return Mesh(world, faces.astype(np.int64), (np.clip(rgb, 0, 1) * 255).round().astype(np.uint8))
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area-weighted, [V, 3] unit."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normal, face = np.zeros_like(vertices), np.cross(b - a, c - a)
+    for i in range(3):
+        for axis in range(3):
+            normal[:, axis] += np.bincount(faces[:, i], face[:, axis], len(vertices))
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.where(length > 0, normal / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
 
 
 def fill_pinholes(field: np.ndarray, known: np.ndarray, enough: float = 14 / 27, rounds: int = 2) -> tuple[np.ndarray, np.ndarray]:
