@@ -19,7 +19,7 @@ class DiscoveryConfig:
     min_angle, max_angle: degrees searched.  max_slide: times the box diagonal.
     attach: weight of the rule that a hinge touches the part it carries.
     slide_bonus: a slide has two degrees of freedom less than a turn: share of a part's gain in its favour.
-    split, split_fixed: least share of a part's residual that two amounts about its axis must remove ("auto", below a given number).
+    split, split_fixed: least share of its residual that half a part must lose with an amount of its own ("auto", below a given number).
     min_mass: least share of the moved surface of a part.  min_moved: fewest moved surfels a state below which nothing moved.
     candidates: how many complete explanations are handed back at most.
     """
@@ -35,10 +35,10 @@ class DiscoveryConfig:
     min_angle: float = 5.0
     max_angle: float = 135.0
     max_slide: float = 0.42
-    attach: float = 0.5
+    attach: float = 0.8
     slide_bonus: float = 0.1
-    split: float = 0.14
-    split_fixed: float = 0.12
+    split: float = 0.3
+    split_fixed: float = 0.2
     min_mass: float = 0.015
     min_moved: int = 12
     candidates: int = 4

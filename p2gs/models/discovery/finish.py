@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -37,58 +38,90 @@ def part_samples(problem: Problem, labelling: Labelling, k: int, n: int, moved_o
     return out
 
 
-def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, n: int = 900) -> Motions:
-    """Part k's motion fitted to its labelled points: evidence search, then point-to-plane where it is well determined."""
+def snapped(problem: Problem, motion: Motions, middle: Tensor, axes: Tensor, within: float = 15.0) -> Motions:
+    """``motion`` [1] with its axis turned (about the part's middle) onto each scene direction within ``within`` degrees: [0..]."""
+    c = axes @ motion.axis[0]
+    near = c.abs() > math.cos(math.radians(within))
+    n = int(near.sum())
+    a = motion.axis[0]
+    centre = motion.centre[0] + a * ((middle - motion.centre[0]) @ a)
+    return Motions(motion.turn.expand(n), axes[near] * c[near].sign()[:, None], centre.expand(n, 3), motion.amount.expand(n))
+
+
+def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, axes: Tensor, n: int = 900) -> Motions:
+    """Part k's motion fitted to its labelled points: evidence search, then point-to-plane where it is well determined.
+
+    axes [D, 3]: directions of the static surfaces; an axis near one is laid on it unless that costs evidence.
+    """
     samples = part_samples(problem, labelling, k, n, moved_only=False)
+    m = motions[k : k + 1]
     if min(len(s) for s in samples) < 8:
-        return motions[k : k + 1]
+        return m
     weights = [torch.full((len(s),), 1.0 / len(s)) for s in samples]
+    tp = problem.scale.tp
 
     def gain(m: Motions) -> Tensor:
-        out = []
-        for s in (0, 1):
-            c = problem.cost(m, s, samples[s])[0]
-            out.append((1 - c).mean(1))
+        out = [(1 - problem.cost(m, s, samples[s])[0]).mean(1) for s in (0, 1)]
         return balanced(out[0], out[1])
 
-    m = motions[k : k + 1]
-    start = gain(m)
-    m, v = pattern_search(gain, m, 0.3 * problem.scale.tp, 10, value=start)
-    fine = gauss_newton(problem, m, samples, weights, rounds=4, width0=1.0 * problem.scale.tp, width1=0.5 * problem.scale.tp)
-    return fine if float(gain(fine)) > float(v) - 0.01 else m
+    def sharpen(m: Motions) -> tuple[Motions, Tensor]:
+        m, v = pattern_search(gain, m, 0.3 * tp, 10)
+        fine = gauss_newton(problem, m, samples, weights, rounds=4, width0=tp, width1=0.5 * tp)
+        w = gain(fine)
+        return (fine, w) if float(w) > float(v) - 0.01 else (m, v)
+
+    free, value = sharpen(m)
+    middle = problem.surfels[0].points[samples[0]].mean(0)
+    on_axis = snapped(problem, free, middle, axes)
+    if len(on_axis):
+        on_axis, v = pattern_search(gain, on_axis, 0.5 * tp, 10, tilt=False)
+        best = int(v.argmax())
+        if float(1 - v[best] / 2) < 1.04 * float(1 - value / 2) + 0.004:
+            return on_axis[best : best + 1]
+    return free
 
 
-def split_amounts(problem: Problem, labelling: Labelling, graphs: list[Graph], motions: Motions, k: int, reach: float = 4.0, steps: int = 21):
-    """Do two amounts about one axis explain part k better than one?  (improvement, amount a, amount b).
+def split_amounts(problem: Problem, labelling: Labelling, graphs: list[Graph], motions: Motions, k: int, reach: float = 4.0, steps: int = 25):
+    """Do two amounts about one axis explain part k better than one?  (evidence, amount a, amount b).
 
-    Costs of every moved point of the part over amounts within ``reach`` tolerances, averaged over neighbours; the best pair against the
-    best single amount, as the share of the single cost that the pair removes, the smaller of the two states'.
+    Costs of every moved point over amounts within ``reach`` tolerances, averaged over neighbours. Of the best pair, the evidence is what
+    the smaller half saves against the best single amount, relative to its cost, in the state where it saves less; nothing when the
+    amounts differ by less than the tolerance: that is what noise does to one part.
     """
     m = motions[k : k + 1]
-    arm = 0.35 if bool(m.turn) else 1.0
-    delta = torch.linspace(-reach, reach, steps) * problem.scale.tp / arm
+    tp = problem.scale.tp
+    arm = 0.2 * problem.scale.diag if bool(m.turn) else 1.0
+    delta = torch.linspace(-reach, reach, steps) * tp / arm
     many = Motions(m.turn.expand(steps), m.axis.expand(steps, 3), m.centre.expand(steps, 3), m.amount + delta)
-    single, pair = [], []
+    none = (0.0, float(m.amount), float(m.amount))
+    costs = []
     for s in (0, 1):
         index = torch.nonzero((labelling.labels(s) == k + 1) & problem.moved[s])[:, 0]
         if len(index) < 20:
-            return 0.0, float(m.amount), float(m.amount)
+            return none
         c = problem.cost(many, s, index)[0].T  # [P, D]
         full = torch.zeros(len(problem.surfels[s]), steps)
         have = torch.zeros(len(problem.surfels[s]), 1)
         full[index], have[index] = c, 1.0
-        for _ in range(6):
+        for _ in range(8):
             full = graphs[s].average(full * have) / graphs[s].average(have).clamp_min(1e-3) * have
             full[index] = 0.5 * full[index] + 0.5 * c
-        c = full[index]
-        single.append(c.mean(0))
-        pair.append(torch.minimum(c[:, :, None], c[:, None, :]).mean(0))
-    best = int((single[0] + single[1]).argmin())
-    total = pair[0] + pair[1]
-    flat = int(total.argmin())
-    a, b = flat // steps, flat % steps
-    gains = [float((single[s][best] - pair[s][a, b]) / single[s][best].clamp_min(0.02)) for s in (0, 1)]
-    return min(gains), float(many.amount[a]), float(many.amount[b])
+        costs.append(full[index])
+    single = sum(c.mean(0) for c in costs)
+    pair = sum(torch.minimum(c[:, :, None], c[:, None, :]).mean(0) for c in costs)
+    apart = (delta[:, None] - delta[None]).abs() * arm >= 0.9 * tp
+    pair = torch.where(apart, pair, torch.full_like(pair, 9.0))
+    a, b = divmod(int(pair.argmin()), steps)
+    best = int(single.argmin())
+    evidence = []
+    for c in costs:
+        second = c[:, b] < c[:, a]
+        half = second if second.float().mean() < 0.5 else ~second
+        if int(half.sum()) < 10:
+            return none
+        before, after = c[half, best].mean(), torch.minimum(c[half, a], c[half, b]).mean()
+        evidence.append(float((before - after) / before.clamp_min(0.03)) * min(1.0, float(half.float().mean()) / 0.1))
+    return min(evidence), float(many.amount[a]), float(many.amount[b])
 
 
 def with_amounts(motions: Motions, k: int, a: float, b: float) -> Motions:
@@ -99,10 +132,10 @@ def with_amounts(motions: Motions, k: int, a: float, b: float) -> Motions:
     return Motions.cat([Motions(motions.turn, motions.axis, motions.centre, amount), new])
 
 
-def settle_parts(problem: Problem, graphs: list[Graph], motions: Motions, rounds: int = 2) -> tuple[Motions, Labelling]:
-    """Labels and fits in turn."""
+def settle_parts(problem: Problem, graphs: list[Graph], motions: Motions, axes: Tensor, rounds: int = 2) -> tuple[Motions, Labelling]:
+    """Labels and fits in turn. axes [D, 3]: directions of the static surfaces."""
     labelling = label(problem, motions, graphs)
     for _ in range(rounds):
-        motions = Motions.cat([fit_part(problem, labelling, motions, k) for k in range(len(motions))]) if len(motions) else motions
+        motions = Motions.cat([fit_part(problem, labelling, motions, k, axes) for k in range(len(motions))]) if len(motions) else motions
         labelling = label(problem, motions, graphs)
     return motions, labelling

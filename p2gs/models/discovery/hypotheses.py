@@ -73,6 +73,20 @@ def directions(problem: Problem, limit: int = 8, apart: float = 12.0) -> Tensor:
     return torch.stack(chosen)
 
 
+def static_axes(problem: Problem) -> Tensor:
+    """[D, 3] directions that the surfaces of both states share which never moved, and where pairs of them cross."""
+    still = torch.cat([problem.surfels[s].normals[~problem.moved[s]] for s in (0, 1)])
+    peaks = normal_peaks(still, 3, apart=40.0, least=0.06)[0] if len(still) else torch.zeros(0, 3)
+    out = list(peaks)
+    for i in range(len(peaks)):
+        for j in range(i):
+            c = torch.linalg.cross(peaks[i], peaks[j])
+            c = c / c.norm()
+            if all(float((c @ p).abs()) < math.cos(math.radians(20)) for p in out):
+                out.append(c)
+    return torch.stack(out) if out else torch.zeros(0, 3)
+
+
 def arrival_table(landing: Landing, moved: Tensor) -> Tensor:
     """[27 * voxels] uint8: how well a facing pattern at a coarse voxel finds a like surfel there, 0..255; never-moved ones count less."""
     centre = landing._centres(landing.coarse, landing.hc)

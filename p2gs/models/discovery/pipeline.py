@@ -14,7 +14,7 @@ from torch import Tensor
 from p2gs.models.discovery.config import DiscoveryConfig
 from p2gs.models.discovery.evidence import StateEvidence
 from p2gs.models.discovery.finish import Explanation, settle_parts, split_amounts, with_amounts
-from p2gs.models.discovery.hypotheses import directions, sweep
+from p2gs.models.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.models.discovery.labels import Graph, Labelling
 from p2gs.models.discovery.problem import Problem, build_problem
 from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
@@ -58,14 +58,16 @@ def discover(
     if limit > 0 and min(len(s) for s in problem.samples) >= config.min_moved:
         axes = directions(problem)
         swept = sweep(problem, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in problem.samples])
+        still = static_axes(problem)
         lap("hypotheses", 0.4)
         search = Search(problem, swept, limit, config.part_cost_fixed if fixed else config.part_cost)
         solutions = search.solve()
+        solutions += search.alternatives(solutions)
         lap("selection", 0.7)
         figures |= {"axes": axes.tolist(), "motions_tried": len(swept.motions), "search": search.trace}
         for value, chosen in solutions[: config.candidates]:
-            if value > 0 and chosen and value > solutions[0][0] - 0.15:
-                explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, limit, fixed))
+            if value > 0 and chosen:
+                explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, limit, fixed, still))
         lap("labels", 0.95)
     if not explanations:
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]
@@ -88,17 +90,17 @@ def discover(
     return out
 
 
-def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, fixed: bool) -> Explanation:
+def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, fixed: bool, axes: Tensor) -> Explanation:
     """Label and fit a chosen set; part those that share an axis but not an amount; drop parts without mass; score in image space."""
     cfg = problem.config
-    motions, labelling = settle_parts(problem, graphs, motions)
+    motions, labelling = settle_parts(problem, graphs, motions, axes)
     while len(motions) < limit:
         tried = [split_amounts(problem, labelling, graphs, motions, k) for k in range(len(motions))]
         k = max(range(len(tried)), key=lambda i: tried[i][0])
         if tried[k][0] < (cfg.split_fixed if fixed else cfg.split):
             break
-        more, relabelled = settle_parts(problem, graphs, with_amounts(motions, k, *tried[k][1:]))
-        if min(masses(problem, relabelled)) < cfg.min_mass:
+        more, relabelled = settle_parts(problem, graphs, with_amounts(motions, k, *tried[k][1:]), axes)
+        if min(masses(problem, relabelled)) < cfg.min_mass or same_motion(problem, more, k, len(more) - 1):
             break
         motions, labelling = more, relabelled
     while len(motions):
@@ -107,12 +109,18 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
         if mass[k] >= cfg.min_mass:
             break
         motions = motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
-        motions, labelling = settle_parts(problem, graphs, motions, rounds=1)
+        motions, labelling = settle_parts(problem, graphs, motions, axes, rounds=1)
     mass = masses(problem, labelling)
     pays = [p for p in problem.pay(motions)] if len(motions) else []
     doubt = float((torch.tensor(mass) * (1 - plausibility(problem, motions, pays, problem.samples))).sum()) if len(motions) else 0.0
     score = image_score(problem, motions, labelling) + cfg.part_cost * len(motions) + 0.5 * doubt
     return Explanation(motions, labelling, value, score)
+
+
+def same_motion(problem: Problem, motions: Motions, i: int, j: int) -> bool:
+    """Do two motions differ by less than the surfaces' own disagreement?"""
+    probe = torch.cat([problem.surfels[s].points[problem.samples[s]] for s in (0, 1)])
+    return float(motions[i : i + 1].swept(probe, motions[j : j + 1])) < 0.7 * problem.scale.tp
 
 
 def masses(problem: Problem, labelling: Labelling) -> list[float]:

@@ -74,17 +74,20 @@ class Gain:
         return balanced(total[0], total[1])
 
 
-def pattern_search(gain, motions: Motions, length: float, rounds: int = 10, turn_radius: float = 0.4, value: Tensor | None = None) -> tuple[Motions, Tensor]:
+def pattern_search(
+    gain, motions: Motions, length: float, rounds: int = 10, turn_radius: float = 0.4, value: Tensor | None = None, tilt: bool = True
+) -> tuple[Motions, Tensor]:
     """Coordinate steps (both signs, 5 coordinates), step halved where nothing improves. Returns motions and their gains.
 
-    length: first step in scene units; angles step by length / turn_radius. gain: Motions [B] -> [B].
+    length: first step in scene units; angles step by length / turn_radius. gain: Motions [B] -> [B].  tilt: may the axis turn.
     """
     B = len(motions)
     value = gain(motions) if value is None else value
     scale = torch.ones(B) * length
     r = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0])
     turn = torch.tensor([1 / turn_radius, 1 / turn_radius, 1 / turn_radius, 1.0, 1.0])
-    moves = torch.cat([torch.eye(5), -torch.eye(5)])
+    moves = torch.eye(5) if tilt else torch.eye(5)[[0, 3, 4]]
+    moves = torch.cat([moves, -moves])
     for _ in range(rounds):
         unit = torch.where(motions.turn[:, None], turn, r)
         step = (moves[None] * unit[:, None] * scale[:, None, None]).reshape(-1, 5)

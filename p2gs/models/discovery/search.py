@@ -47,7 +47,7 @@ def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples
         weight += pay.float().sum(1) / max(1, len(p))
     unseen = 1.5 * k.tau / (2 * torch.sin(motions.amount.abs().clamp(0.03, math.pi) / 2))
     excess = (near - 0.04 * k.diag - unseen).clamp(0, k.diag)
-    turn = 1 - cfg.attach * (excess / (0.1 * k.diag)).clamp(0, 1)
+    turn = 1 - cfg.attach * (excess / (0.12 * k.diag)).clamp(0, 1)
     turn = turn * (1 - 0.15 * ((motions.amount.abs() - math.radians(80)) / math.radians(55)).clamp(0, 1)) * (1 - cfg.slide_bonus)
     size = motions.amount.abs() / (cfg.max_slide * k.diag)
     slide = (1 - 0.08 * size.clamp(0, 1)) * (1 - 2 * (size - 1).clamp(0, 0.5))
@@ -262,6 +262,25 @@ class Search:
         found = self.unique(found)
         self.trace.append({"pool": len(self.pool.motions), "sets": [(round(self.value(f), 4), len(f)) for f in found[:8]]})
         return [(self.value(f), f) for f in found]
+
+    def alternatives(self, solutions: list[tuple[float, list[int]]], count: int = 2) -> list[tuple[float, list[int]]]:
+        """The best explanation with one motion exchanged for the best really different one: what a later, sharper look may prefer."""
+        if not solutions:
+            return []
+        chosen, m = solutions[0][1], self.pool.motions
+        out = []
+        for k in chosen:
+            rest = [c for c in chosen if c != k]
+            far = m[torch.tensor([k])].swept(self.probe, m)[0] > 3 * self.radius
+            already, best = self.pool.explained(rest), self.pool.best(rest)
+            e = self.pool.effective(torch.arange(len(m)), best)
+            guess = sum((e[s] - already[s]).clamp_min(0).mean(1) for s in (0, 1) if e[s].shape[1])
+            guess = torch.where(far, guess, torch.full_like(guess, -1.0))
+            options = [(self.value([*rest, i]), [*rest, i]) for i in guess.topk(min(4, len(guess))).indices.tolist() if far[i]]
+            if options:
+                out.append(max(options))
+        found = [f for _, f in sorted(out, reverse=True)]
+        return [(self.value(f), f) for f in found if not any(self.same(f, g) for _, g in solutions)][:count]
 
     def unique(self, sets: list[list[int]]) -> list[list[int]]:
         """Best first, without sets whose motions all agree with those of a better one."""
