@@ -179,3 +179,13 @@ def test_window():
 def test_native_is_there():
     """The tests above would silently compare the reference with itself."""
     assert native is not None
+
+
+def test_value_without_gradient_at_any_alignment():
+    """Scratch memory may start anywhere: sizes that move it about, with and without a gradient, give the same value."""
+    for height, width in ((64, 64), (96, 112), (101, 37), (33, 200)):
+        generator = torch.Generator().manual_seed(height)
+        a, b = torch.rand(2, height, width, 3, generator=generator)
+        with torch.no_grad():
+            value = l1_ssim(a, b, 0.8)
+        assert torch.equal(value, l1_ssim(a.clone().requires_grad_(), b, 0.8).detach())
