@@ -230,7 +230,7 @@ class Pipeline:
 
     def write(self, learned: handover.Articulation, states) -> dict:
         """The twin and the result folder; returns what a later run needs to know of it."""
-        from p2gs.export.run_folder import write_twin
+        from p2gs.export.run_folder import complete_run, write_twin
 
         obj, notes = finish(
             learned,
@@ -245,6 +245,9 @@ class Pipeline:
         for note in notes:
             print(note, flush=True)
         write_twin(obj, self.run_dir, self.scene)
+        exports = self.cfg.phases["finish"].config.exports
+        if exports:
+            complete_run(self.run_dir, exports, log=partial(print, flush=True))
         return {"parts": len(obj.parts), "notes": notes}
 
 

@@ -24,14 +24,16 @@ class FinishConfig:
     polish: photometric refinement of the screws with hard labels and frozen Gaussians.  min_mass: a slot with a smaller share of the
     solid Gaussians vanishes.  min_motion: likewise one that moves its points by less (internal units).  prismatic_below: a free motion
     (paper's start) that turns by less than this many degrees is a slide.  clean_neighbours: labels are the majority among this many
-    neighbours at canonical time (0 = as learned).
+    neighbours at canonical time (0 = as learned).  exports: simulator formats written at the end of a fit, with meshes and report (empty:
+    neither; `p2gs export` makes them later).
     """
 
-    polish: PolishConfig = field(default_factory=PolishConfig)
+    polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.8))
     min_mass: float = 0.002
     min_motion: float = 0.01
     prismatic_below: float = 5.0
     clean_neighbours: int = 8
+    exports: list[str] = field(default_factory=lambda: ["urdf", "mjcf", "glb"])
 
 
 @PHASES.register("finish")

@@ -17,6 +17,7 @@ from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.phase import PHASES
 from p2gs.models.screw_polish import PolishConfig, average_motion, photometric_cost, polish
 from p2gs.ops import se3, so3
+from p2gs.ops.knn import knn
 from p2gs.types import TwoStateScene
 
 
@@ -27,7 +28,9 @@ class PartMotionsConfig:
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
     candidates: how many complete explanations are compared by re-rendering.  coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
-    freedom_penalty: relative image loss by which the freer type (revolute) must win.
+    freedom_penalty: relative image loss by which the freer explanation must win: a turn against a slide, a further part against one less.
+    same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one
+    unless the image loss rises by more than this share.
     """
 
     evidence_size: int = 200
@@ -35,6 +38,8 @@ class PartMotionsConfig:
     candidates: int = 3
     compare_types_below: float = 20.0
     freedom_penalty: float = 0.002
+    same_motion: float = 0.04
+    merge_penalty: float = 0.012
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
 
@@ -72,6 +77,7 @@ def find_part_motions(
         if len(explanations) > 1:
             say(f"re-rendering explanation {number + 1} of {len(explanations)}")
         motions = refine(states, motions, views, config.coarse, seed=seed, backend=backend, device=device)
+        motions = simplify(states, motions, views, config, backend=backend, device=device)
         cost = explanation_cost(states, motions, views, level, backend, device)
         costs.append(cost)
         if best is None or cost < best[0]:
@@ -83,8 +89,12 @@ def find_part_motions(
 
 
 def _explanations(found) -> list:
-    """The chosen explanation first, then the alternatives."""
-    return [found, *[c for c in found.candidates if c is not found]]
+    """The chosen explanation first, then the alternatives that differ from it."""
+
+    def signature(e):
+        return [(m.type, torch.as_tensor(m.transform).double().round(decimals=4).tolist()) for m in e.motions]
+
+    return [found, *[c for c in found.candidates if signature(c) != signature(found)]]
 
 
 def _label_states(explanation, states: list[StateGaussians]) -> PartMotions:
@@ -129,6 +139,63 @@ def explanation_cost(states, motions: PartMotions, views, level: int, backend: s
     there = photometric_cost(states[0].gaussians, motions.labels[0], motions.transforms, views[1], level=level, backend=backend, device=device)
     back = photometric_cost(states[1].gaussians, motions.labels[1], se3.inverse(motions.transforms), views[0], level=level, backend=backend, device=device)
     return 0.5 * (there + back)
+
+
+def simplify(states, motions: PartMotions, views, config: PartMotionsConfig, *, backend: str, device="cpu") -> PartMotions:
+    """Make one of touching parts with one motion, and drop parts without which the images are explained as well."""
+    cost = explanation_cost(states, motions, views, config.coarse.levels[-1], backend, device)
+    tried: set[tuple] = set()
+    while len(motions):
+        found = None
+        for change, reduced in _reductions(states, motions, config.same_motion):
+            if change in tried:
+                continue
+            tried.add(change)
+            lower = explanation_cost(states, reduced, views, config.coarse.levels[-1], backend, device)
+            penalty = config.merge_penalty if change[0] == "merge" else config.freedom_penalty
+            if lower <= cost * (1 + penalty):
+                found = (reduced, lower)
+                break
+        if found is None:
+            return motions
+        motions, cost = found[0], min(cost, found[1])
+        tried.clear()
+    return motions
+
+
+def _reductions(states, motions: PartMotions, same_motion: float):
+    """Explanations with one part less: (what changed, motions). Merging comes first, small parts go before large ones."""
+    solid = [torch.sigmoid(s.gaussians.opacity_logits) > 0.5 for s in states]
+    points = [states[0].gaussians.means[solid[0] & (motions.labels[0] == k + 1)].double() for k in range(len(motions))]
+    order = sorted(range(len(motions)), key=lambda k: len(points[k]))
+    for i, small in enumerate(order):
+        for large in reversed(order[i + 1 :]):
+            if min(len(points[small]), len(points[large])) < 5:
+                continue
+            gap = se3.apply(motions.transforms[small], points[small]) - se3.apply(motions.transforms[large], points[small])
+            if float(gap.norm(dim=1).mean()) < same_motion and _touch(points[small], points[large]):
+                yield ("merge", small, large), without_part(motions, small, large + 1)
+    for small in order:
+        yield ("drop", small), without_part(motions, small, 0)
+
+
+def _touch(a: Tensor, b: Tensor) -> bool:
+    """Whether two point sets [N, 3], [M, 3] come as near to each other somewhere as the smaller one's points are to theirs."""
+    if len(a) > len(b):
+        a, b = b, a
+    spacing = knn(a, None, 1, True)[0].median()
+    return float(knn(b, a, 1, False)[0].quantile(0.02)) < 3 * float(spacing)
+
+
+def without_part(motions: PartMotions, index: int, into: int) -> PartMotions:
+    """The same motions without entry ``index``; its Gaussians get label ``into`` (numbered as before: 0 static, k + 1 for entry k)."""
+    keep = [k for k in range(len(motions)) if k != index]
+    renumber = torch.zeros(len(motions) + 1, dtype=torch.int64)
+    for new, old in enumerate(keep):
+        renumber[old + 1] = new + 1
+    renumber[index + 1] = renumber[into]
+    labels = [renumber[l] for l in motions.labels]
+    return PartMotions([motions.types[k] for k in keep], motions.transforms[keep], motions.confidence[keep], labels, motions.margin, motions.diagnostics)
 
 
 def settle_types(states, motions: PartMotions, views, config: PartMotionsConfig, *, seed: int, backend: str, device="cpu") -> PartMotions:
