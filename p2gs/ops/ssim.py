@@ -46,8 +46,9 @@ def l1_ssim(
     """(1 - ssim_lambda) mean|pred - target| + ssim_lambda (1 - SSIM(pred, target)), a scalar differentiable by pred.
 
     pred, target: [H, W, 3] in [0, 1].  mask_box: (x, y, width, height); the loss of that window alone, as if both images were
-    cropped to it.  cache, key: a mapping in which the window means of the target are kept between calls. They are used again only
-    for the same tensor in the same memory and unchanged, so a target that is composed anew each step is merely not cached.
+    cropped to it.  cache, key: a mapping in which the window means of the target are kept between calls, under ("l1_ssim", key).
+    They are used again only for the same tensor in the same memory and unchanged, so a target that is composed anew each step is
+    merely not cached.
 
     float32 CPU images take the native kernel (value and gradient in one pass), all others ``l1_ssim_reference``.
     Raises ValueError when the shapes do not fit.
@@ -108,6 +109,7 @@ def _statistics(cache, key, target: Tensor) -> tuple[bool, Tensor]:
     height, width, _ = target.shape
     if cache is None or key is None:
         return False, target.new_empty(2, height, native.ssim_padded(3 * width))
+    key = ("l1_ssim", key)
     entry = cache.get(key)
     if isinstance(entry, TargetStatistics) and entry.belongs_to(target):
         return True, entry.planes

@@ -90,7 +90,7 @@ def test_cache_changes_nothing_and_is_not_fooled():
     for _ in range(2):
         value, grad = value_and_grad(l1_ssim, pred, target, cache=cache, key="view")
         assert value == plain[0] and torch.equal(grad, plain[1])
-    assert cache["view"] is not None
+    assert list(cache) == [("l1_ssim", "view")] and cache["l1_ssim", "view"] is not None
 
     target.mul_(0.5)  # the same tensor with other content
     value, grad = value_and_grad(l1_ssim, pred, target, cache=cache, key="view")
@@ -105,7 +105,7 @@ def test_cache_keeps_nothing_for_targets_composed_anew():
         anew = target * (1 - 0.1 * step)
         value = l1_ssim(pred, anew, cache=cache, key=0).item()
         assert value == l1_ssim(pred, anew).item()
-    assert cache == {0: None}
+    assert cache == {("l1_ssim", 0): None}
 
 
 @pytest.mark.parametrize("cached", [False, True])
