@@ -106,7 +106,8 @@ def parser(prog: str = "p2gs") -> Parser:
     ready.add_argument("root", metavar="DIR", help="the downloaded tree")
     ready.add_argument("--objects", nargs="+", default=["all"], metavar="NAME", help="benchmarks or object ids (default all)")
 
-    bench = add("bench", "run objects x settings x seeds, or time the rasterizers", epilog=BENCH_HELP)
+    bench = add("bench", "run objects x settings x seeds; bench kernels: time the rasterizers", epilog=BENCH_HELP)
+    bench.set_defaults(action="runs")
     bench.add_argument("-c", "--config", **several, metavar="FILE", help="YAML files of benches, such as bench/paris.yaml")
     bench.add_argument("--root", metavar="DIR", help="the tree that holds the objects")
     bench.add_argument("--out", metavar="DIR", help="result folder (default runs/bench/<name>)")
@@ -117,10 +118,6 @@ def parser(prog: str = "p2gs") -> Parser:
     bench.add_argument("--processes", metavar="N", help="runs at once, for local (default 1)")
     bench.add_argument("--dry_run", action="store_true", help="print the runs and their commands and stop")
     bench.add_argument("--skip_failed", action="store_true", help="do not try again what failed before")
-    what = bench.add_subparsers(dest="action", metavar="[kernels]")
-    kernels = what.add_parser("kernels", help="time the rasterizers", description="Time the rasterizers.", add_help=False)
-    kernels.add_argument("words", nargs=argparse.REMAINDER)
-
     table = add("table", "put a bench's results beside the paper's: Markdown, LaTeX, CSV, plots")
     table.add_argument("bench", metavar="BENCH_DIR", help="result folder of a bench")
     table.add_argument("--tables", nargs="+", metavar="NAME", help="tables of the paper to fill (default: those that the bench names)")
@@ -134,7 +131,10 @@ def run(words: list[str], prog: str = "p2gs") -> int:
     """Parse and carry out one command; returns the exit code. Mistakes come as one line ``error: ...`` on stderr."""
     top = parser(prog)
     try:
-        args, rest = top.parse_known_args(words)
+        if words[:2] == ["bench", "kernels"]:  # has options of its own; a positional of bench would take the values of --key value
+            args, rest = argparse.Namespace(command="bench", action="kernels"), words[2:]
+        else:
+            args, rest = top.parse_known_args(words)
         if args.command is None:
             top.print_help()
             return 0

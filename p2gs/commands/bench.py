@@ -13,7 +13,7 @@ def bench(args: argparse.Namespace, words: list[str]) -> int:
     if args.action == "kernels":
         from p2gs.bench.kernels import main
 
-        return main([*args.words, *words])
+        return main(words)
     if not args.config:
         raise UserError("bench needs a file: p2gs bench -c bench/paris.yaml --root DIR (or: p2gs bench kernels)")
     from p2gs.bench.plan import read_bench
