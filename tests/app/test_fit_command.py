@@ -57,6 +57,7 @@ def test_print_config_shows_defaults_and_reads_back(config, write, pipeline, cap
         "start": 0.0,
         "end": 1.0,
         "end_weight": None,
+        "every": 1,
         "temperature": 1.0,
         "variant": "sane",
     }
