@@ -96,7 +96,7 @@ void scatter(RasterFrame& f, const uint64_t* order, uint32_t count, uint32_t* cu
 
 Frame::~Frame() {
     for (size_t c = 0; c < pairs_size; ++c) std::free(pairs[c].data);
-    void* all[] = {records, pair_range, pairs, chunk_slot, keys, ids, visible, tile_begin, tile_end, entries, slots,
+    void* all[] = {records, pair_range, pairs, chunk_slot, keys, ids, visible, tile_begin, tile_end, tile_blocks, entries, slots,
                    slot_used, slopes_memory, sort.a, sort.b, sort.counts, tile_counts};
     for (void* p : all) std::free(p);
 }
@@ -117,6 +117,7 @@ void Frame::forward(const RasterArgs& a, bool keep, int threads) {
     reserve(chunk_slot, chunk_slot_size, size_t(chunks) + 1);
     reserve(tile_begin, tile_begin_size, tiles + 1);
     reserve(tile_end, tile_end_size, tiles);
+    reserve(tile_blocks, tile_blocks_size, tiles);
     reserve(tile_counts, tile_counts_size, tiles * size_t(threads));
     if (size_t(chunks) > pairs_size) {
         size_t grown = size_t(chunks) + 8;

@@ -79,6 +79,7 @@ struct RasterFrame {
     uint32_t *keys, *ids;           // n: visible Gaussians of chunk c from c * kChunk on; bits of their depth
     uint32_t* visible;              // chunks
     uint32_t* tile_begin;           // tiles + 1
+    uint64_t* tile_blocks;          // tiles: blocks that any pair may touch
     uint32_t* tile_end;             // tiles: end of what forward looked at
     RasterEntry* entries;           // pairs in all, by tile, near to far
     float* slots;

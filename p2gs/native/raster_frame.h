@@ -30,7 +30,7 @@ struct Frame : RasterFrame {
     uint32_t* tile_counts = nullptr;
     size_t records_size = 0, pair_range_size = 0, pairs_size = 0, chunk_slot_size = 0, keys_size = 0, ids_size = 0,
            visible_size = 0, tile_begin_size = 0, tile_end_size = 0, entries_size = 0, slots_size = 0, slot_used_size = 0,
-           tile_counts_size = 0, slopes_size = 0;
+           tile_counts_size = 0, slopes_size = 0, tile_blocks_size = 0;
 };
 
 }  // namespace p2gs

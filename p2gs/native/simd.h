@@ -27,12 +27,14 @@ typedef VI VM;
 #define P2GS_SHUFFLE4(a, b, i, j, k, l) __builtin_shuffle(a, b, (I4){i, j, k, l})
 #endif
 
-P2GS_INLINE void prefetch_lines(const void* p, int64_t bytes) {
-    for (int64_t i = 0; i < bytes; i += 64) __builtin_prefetch(static_cast<const char*>(p) + i);
+P2GS_INLINE const char* prefetch_lines(const char* p, int64_t bytes) {
+    for (int64_t i = 0; i < bytes; i += 64) __builtin_prefetch(p + i);
+    return p + bytes;
 }
 
 P2GS_INLINE VF load(const float* p) { return *reinterpret_cast<const VF*>(p); }
 P2GS_INLINE void store(float* p, VF v) { *reinterpret_cast<VF*>(p) = v; }
+P2GS_INLINE void store_int(int32_t* p, VI v) { *reinterpret_cast<VI*>(p) = v; }
 P2GS_INLINE VF loadu(const float* p) {
     VF v;
     memcpy(&v, p, sizeof v);
@@ -75,7 +77,7 @@ P2GS_INLINE VF floor(VF a) { return (VF)_mm512_roundscale_ps((__m512)a, 9); }
 P2GS_INLINE VI to_int(VF a) { return (VI)_mm512_cvttps_epi32((__m512)a); }
 P2GS_INLINE VM ge(VF a, VF b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
 P2GS_INLINE VM gt(VF a, VF b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
-P2GS_INLINE VM lt(VF a, VF b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ); }
+P2GS_INLINE VM lt(VM m, VF a, VF b) { return _mm512_mask_cmp_ps_mask(m, (__m512)a, (__m512)b, _CMP_LT_OQ); }
 P2GS_INLINE VM le(VF a, VF b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
 P2GS_INLINE VM gt(VM m, VF a, VF b) { return _mm512_mask_cmp_ps_mask(m, (__m512)a, (__m512)b, _CMP_GT_OQ); }
 P2GS_INLINE VM le(VM m, VF a, VF b) { return _mm512_mask_cmp_ps_mask(m, (__m512)a, (__m512)b, _CMP_LE_OQ); }
@@ -84,15 +86,9 @@ P2GS_INLINE VM but_not(VM a, VM b) { return VM(a & ~b); }
 P2GS_INLINE VF zero_unless(VM m, VF a) { return (VF)_mm512_maskz_mov_ps(m, (__m512)a); }
 P2GS_INLINE VF mul_if(VM m, VF a, VF b) { return (VF)_mm512_maskz_mul_ps(m, (__m512)a, (__m512)b); }
 P2GS_INLINE VF pick(VM m, VF yes, VF no) { return (VF)_mm512_mask_mov_ps((__m512)no, m, (__m512)yes); }
-// a where m, else -|b|
-P2GS_INLINE VF after_unless_finished(VM m, VF a, VF b) {
-    __m512i sign = _mm512_set1_epi32(int(0x80000000u));
-    return (VF)_mm512_mask_mov_epi32(_mm512_or_epi32((__m512i)b, sign), m, (__m512i)a);
-}
 P2GS_INLINE bool any(VM m) { return m != 0; }
 P2GS_INLINE unsigned bits(VM m) { return m; }
 P2GS_INLINE VM lanes_of(unsigned bits) { return VM(bits); }
-P2GS_INLINE bool any_positive(VF a) { return _mm512_movepi32_mask((__m512i)a) != 0xffff; }  // no lane's sign bit clear: false
 P2GS_INLINE VF reciprocal(VF a) {
     __m512 r = _mm512_rcp14_ps((__m512)a);
     __m512 e = _mm512_fnmadd_ps((__m512)a, r, _mm512_set1_ps(1.0f));
@@ -114,7 +110,6 @@ P2GS_INLINE VI to_int(VF a) { return (VI)_mm256_cvttps_epi32((__m256)a); }
 P2GS_INLINE VF pick(VM m, VF yes, VF no) { return (VF)_mm256_blendv_ps((__m256)no, (__m256)yes, (__m256)m); }
 P2GS_INLINE bool any(VM m) { return _mm256_movemask_ps((__m256)m) != 0; }
 P2GS_INLINE unsigned bits(VM m) { return unsigned(_mm256_movemask_ps((__m256)m)); }
-P2GS_INLINE bool any_positive(VF a) { return _mm256_movemask_ps((__m256)a) != 0xff; }
 P2GS_INLINE VF reciprocal(VF a) {
     __m256 r = _mm256_rcp_ps((__m256)a);
     __m256 e = _mm256_fnmadd_ps((__m256)a, r, _mm256_set1_ps(1.0f));
@@ -164,14 +159,13 @@ P2GS_INLINE VF floor(VF a) {
     return t - (VF)((t > a) & (VI)set(1.0f));
 }
 P2GS_INLINE bool any(VM m) { return bits(m) != 0; }
-P2GS_INLINE bool any_positive(VF a) { return bits((VI)a >> 31) != 0xf; }
 #endif
 
 #if !defined(__AVX512F__)
 P2GS_INLINE VF abs(VF a) { return (VF)((VI)a & 0x7fffffff); }
 P2GS_INLINE VM ge(VF a, VF b) { return a >= b; }
 P2GS_INLINE VM gt(VF a, VF b) { return a > b; }
-P2GS_INLINE VM lt(VF a, VF b) { return a < b; }
+P2GS_INLINE VM lt(VM m, VF a, VF b) { return m & (a < b); }
 P2GS_INLINE VM le(VF a, VF b) { return a <= b; }
 P2GS_INLINE VM gt(VM m, VF a, VF b) { return m & (a > b); }
 P2GS_INLINE VM le(VM m, VF a, VF b) { return m & (a <= b); }
@@ -179,7 +173,6 @@ P2GS_INLINE VM both(VM a, VM b) { return a & b; }
 P2GS_INLINE VM but_not(VM a, VM b) { return a & ~b; }
 P2GS_INLINE VF zero_unless(VM m, VF a) { return (VF)(m & (VI)a); }
 P2GS_INLINE VF mul_if(VM m, VF a, VF b) { return (VF)(m & (VI)(a * b)); }
-P2GS_INLINE VF after_unless_finished(VM m, VF a, VF b) { return pick(m, a, (VF)((VI)b | int(0x80000000u))); }
 #endif
 
 #if !defined(__AVX512F__)
@@ -408,4 +401,22 @@ P2GS_INLINE void store_rows(float* p, int count, const VF* in) {
         for (int k = 0; k < K; ++k) to[K * i + k] = columns[k][i];
 #endif
     if (count < W) memcpy(p, copy, 4 * K * count);
+}
+
+// out[i] = sum over lanes of v[i], i < 16.
+P2GS_INLINE void sum16(const VF* v, float* out) {
+#if defined(__AVX512F__)
+    __m512 q[4];  // per 128 bits: partial sums of v[4 i .. 4 i + 3]
+    for (int i = 0; i < 4; ++i) {
+        const __m512 a = (__m512)v[4 * i], b = (__m512)v[4 * i + 1], c = (__m512)v[4 * i + 2], d = (__m512)v[4 * i + 3];
+        __m512 ab = _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b));
+        __m512 cd = _mm512_add_ps(_mm512_unpacklo_ps(c, d), _mm512_unpackhi_ps(c, d));
+        q[i] = _mm512_add_ps(_mm512_shuffle_ps(ab, cd, 0x44), _mm512_shuffle_ps(ab, cd, 0xee));
+    }
+    __m512 a = _mm512_add_ps(_mm512_shuffle_f32x4(q[0], q[1], 0x44), _mm512_shuffle_f32x4(q[0], q[1], 0xee));
+    __m512 b = _mm512_add_ps(_mm512_shuffle_f32x4(q[2], q[3], 0x44), _mm512_shuffle_f32x4(q[2], q[3], 0xee));
+    _mm512_store_ps(out, _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x88), _mm512_shuffle_f32x4(a, b, 0xdd)));
+#else
+    for (int i = 0; i < 16; i += 4) storeu4(out + i, sum4(v[i], v[i + 1], v[i + 2], v[i + 3]));
+#endif
 }
