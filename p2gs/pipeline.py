@@ -47,7 +47,9 @@ class Pipeline:
             torch.set_num_threads(cfg.threads)
         missing = [name for name in STAGES if name not in cfg.phases]
         if missing:
-            raise UserError(f"phases.{missing[0]} is not in the config; expected all of {', '.join(STAGES)} (start from -c configs/preset/cpu.yaml)")
+            raise UserError(
+                f"phases.{missing[0]} is not in the config; expected all of {', '.join(STAGES)} (start from -c configs/preset/cpu.yaml)"
+            )
         self.init = cfg.phases["articulation"].config.init
         if self.init != "discovery" and cfg.num_parts == "auto":
             raise UserError(f"num_parts: auto needs phases.articulation.init: discovery (it is '{self.init}'); give --num_parts N")
@@ -77,7 +79,10 @@ class Pipeline:
     def key(self, stage: str) -> str:
         """Hash of all that decides a stage's result."""
         cfg = self.cfg
-        common = {n: cfg.section(n) for n in ("seed", "num_parts", "rasterizer")} | {"data": cfg.section("data"), "device": self.device.type}
+        common = {n: cfg.section(n) for n in ("seed", "num_parts", "rasterizer")} | {
+            "data": cfg.section("data"),
+            "device": self.device.type,
+        }
         if stage.startswith("single_state"):
             del common["num_parts"]
         chain = [common]
@@ -108,7 +113,9 @@ class Pipeline:
     def run(self, only: Optional[str] = None) -> Path:
         self.run_dir.mkdir(parents=True, exist_ok=True)
         save_config(self.cfg, self.run_dir / "config.yaml")
-        states = [self.stage(f"single_state_{s}", only, partial(self.train, f"single_state_{s}", partial(self.single_state, s))) for s in (0, 1)]
+        states = [
+            self.stage(f"single_state_{s}", only, partial(self.train, f"single_state_{s}", partial(self.single_state, s))) for s in (0, 1)
+        ]
         if only == "single_state":
             return self.run_dir
         motions = self.stage("discovery", only, lambda: self.discover(states)) if self.init == "discovery" else None
@@ -117,7 +124,9 @@ class Pipeline:
         canonical = self.stage("canonical_fusion", only, partial(self.train, "canonical_fusion", partial(self.fusion, states, motions)))
         if only == "canonical_fusion":
             return self.run_dir
-        learned = self.stage("articulation", only, partial(self.train, "articulation", partial(self.articulate, canonical, states, motions)))
+        learned = self.stage(
+            "articulation", only, partial(self.train, "articulation", partial(self.articulate, canonical, states, motions))
+        )
         if only == "articulation":
             return self.run_dir
         self.stage("finish", only, lambda: self.write(learned, states))

@@ -21,7 +21,6 @@ from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors
 
-
 IMAGE_LOSSES = ("render", "alpha", "depth", "depth_variance", "opacity")  # they look at no part state, which costs time to make
 
 
@@ -162,7 +161,9 @@ class ArticulationPhase(ImagePhase):
         if self._active("art") and pairs.numel() >= 3:
             weights = probs.detach()[pairs].T + 1e-9
             target_rotation = so3.kabsch(mu0.expand(len(weights), -1, 3), mu1.expand(len(weights), -1, 3), weights)[0]
-        hardness = (self.config.temperature - self.temperature(self.step)) / max(self.config.temperature - self.config.temperature_end, 1e-9)
+        hardness = (self.config.temperature - self.temperature(self.step)) / max(
+            self.config.temperature - self.config.temperature_end, 1e-9
+        )
         uniform = bool((self.times == self.times[0]).all())
         return PartState(
             probs=probs,

@@ -113,7 +113,9 @@ def fuse(g0: GaussianTensors, g1: GaussianTensors, motions: PartMotions | None, 
     solid = [torch.sigmoid(g.opacity_logits) > config.min_opacity for g in (g0, g1)]
     p0, p1 = g0.means[solid[0]], g1.means[solid[1]]
     if min(len(p0), len(p1)) < 10:
-        raise UserError(f"canonical_fusion: only {min(len(p0), len(p1))} Gaussians of a state are opaque; expected a reconstructed object (train single_state longer)")
+        raise UserError(
+            f"canonical_fusion: only {min(len(p0), len(p1))} Gaussians of a state are opaque; expected a reconstructed object (train single_state longer)"
+        )
     if config.fusion == "none":
         return _start_state_only(g0, motions)
     d01, d10 = motion_richness(p0, p1, config.trim), motion_richness(p1, p0, config.trim)

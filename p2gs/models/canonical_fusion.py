@@ -34,7 +34,15 @@ class CanonicalFusionPhase(ImagePhase):
 
     Config = CanonicalFusionConfig
 
-    def __init__(self, config: CanonicalFusionConfig, losses: dict[str, Loss], states: list[StateGaussians], motions: PartMotions | None, views, **common):
+    def __init__(
+        self,
+        config: CanonicalFusionConfig,
+        losses: dict[str, Loss],
+        states: list[StateGaussians],
+        motions: PartMotions | None,
+        views,
+        **common,
+    ):
         super().__init__(config, losses, views, **common)
         fused = fuse(states[0].gaussians, states[1].gaussians, motions, config.canonical)
         transforms = motions.transforms if motions is not None else torch.zeros(0, 4, 4).double()
@@ -64,7 +72,9 @@ class CanonicalFusionPhase(ImagePhase):
         state = step % 2
         camera, target = self.target(step // 2, state)
         g = self.posed(state)
-        return LossInputs(step, self.total_steps, self.splats.tensors(), self.render(g, camera, target.background), target, camera, cache=self.loss_cache)
+        return LossInputs(
+            step, self.total_steps, self.splats.tensors(), self.render(g, camera, target.background), target, camera, cache=self.loss_cache
+        )
 
     def hand_over(self) -> CanonicalGaussians:
         s = self.splats

@@ -11,7 +11,9 @@ from p2gs.types import Camera, GaussianTensors, View
 
 
 @torch.no_grad()
-def render_depths(g: GaussianTensors, cameras: list[Camera], backend: str = "auto", device: torch.device | str = "cpu") -> tuple[list[Tensor], list[Tensor]]:
+def render_depths(
+    g: GaussianTensors, cameras: list[Camera], backend: str = "auto", device: torch.device | str = "cpu"
+) -> tuple[list[Tensor], list[Tensor]]:
     """Depth [H, W] (0 where the ray meets little) and alpha [H, W] of each camera.
 
     The median depth (where the ray's transmittance passes one half) does not mix a front with what shows behind its edge, as
@@ -39,7 +41,9 @@ def object_window(view: View, size: int, margin: float = 0.06) -> Camera:
     return window.scaled(size, size)
 
 
-def gather_evidence(g: GaussianTensors, views: list[View], size: int, min_opacity: float, backend: str = "auto", device="cpu") -> StateEvidence:
+def gather_evidence(
+    g: GaussianTensors, views: list[View], size: int, min_opacity: float, backend: str = "auto", device="cpu"
+) -> StateEvidence:
     """Evidence of one state: centres and colours of its solid Gaussians, depth and alpha maps of its training views.
 
     size: side of the maps in pixels; each shows the object's window of its view. Gaussians below ``min_opacity`` are left out of

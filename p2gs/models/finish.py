@@ -105,12 +105,24 @@ def constrain(kind: str, T: Tensor, centre: Tensor) -> Tensor:
 
 
 def finish(
-    learned: Articulation, states: list[StateGaussians], views, config: FinishConfig, similarity: Similarity, *, seed: int, backend: str, device="cpu"
+    learned: Articulation,
+    states: list[StateGaussians],
+    views,
+    config: FinishConfig,
+    similarity: Similarity,
+    *,
+    seed: int,
+    backend: str,
+    device="cpu",
 ) -> tuple[ArticulatedObject, list[str]]:
     """The twin, and one line for each slot that vanished."""
     labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
     alive = surviving_slots(learned, labels, config)
-    notes = [f"slot {k} of {len(learned.types)} vanished: no Gaussians of its own, or no motion" for k in range(1, len(learned.types) + 1) if k not in alive]
+    notes = [
+        f"slot {k} of {len(learned.types)} vanished: no Gaussians of its own, or no motion"
+        for k in range(1, len(learned.types) + 1)
+        if k not in alive
+    ]
     remap = torch.zeros(len(learned.types) + 1, dtype=torch.int64)
     for new, old in enumerate(alive):
         remap[old] = new + 1

@@ -67,7 +67,10 @@ def find_part_motions(
     """Parts, motions and labels of every Gaussian of both states, from the reconstructions and the images alone."""
     say = report or (lambda text: None)
     say("rendering depth of both states")
-    evidence = [gather_evidence(s.gaussians, scene.select(state=s.state, split="train"), config.evidence_size, config.min_opacity, backend, device) for s in states]
+    evidence = [
+        gather_evidence(s.gaussians, scene.select(state=s.state, split="train"), config.evidence_size, config.min_opacity, backend, device)
+        for s in states
+    ]
     say("looking for parts")
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
     explanations = _explanations(found)[: max(config.candidates, 1)]
@@ -107,7 +110,11 @@ def _label_states(explanation, states: list[StateGaussians]) -> PartMotions:
         labels.append(torch.as_tensor(lab, dtype=torch.int64))
         margin.append(torch.as_tensor(mar, dtype=torch.float32))
     types = [m.type for m in explanation.motions]
-    transforms = torch.stack([torch.as_tensor(m.transform, dtype=torch.float64) for m in explanation.motions]) if types else torch.zeros(0, 4, 4).double()
+    transforms = (
+        torch.stack([torch.as_tensor(m.transform, dtype=torch.float64) for m in explanation.motions])
+        if types
+        else torch.zeros(0, 4, 4).double()
+    )
     confidence = torch.tensor([float(m.confidence) for m in explanation.motions])
     return PartMotions(types, transforms, confidence, labels, margin)
 
@@ -117,18 +124,36 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
     return torch.where(motions.margin[state] >= min_margin, motions.labels[state], -1)
 
 
-def refine(states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu", types=None, both: bool = True) -> PartMotions:
+def refine(
+    states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu", types=None, both: bool = True
+) -> PartMotions:
     """Photometric refinement of all motions: start Gaussians into the end images, then end Gaussians into the start images; the mean of both."""
     if config.steps <= 0 or len(motions) == 0:
         return motions
     types = types or motions.types
     forward, _ = polish(
-        states[0].gaussians, polish_labels(motions, 0, config.min_margin), motions.transforms, types, views[1], config, seed=seed, backend=backend, device=device
+        states[0].gaussians,
+        polish_labels(motions, 0, config.min_margin),
+        motions.transforms,
+        types,
+        views[1],
+        config,
+        seed=seed,
+        backend=backend,
+        device=device,
     )
     result = forward
     if both:
         backward, _ = polish(
-            states[1].gaussians, polish_labels(motions, 1, config.min_margin), se3.inverse(forward), types, views[0], config, seed=seed + 1, backend=backend, device=device
+            states[1].gaussians,
+            polish_labels(motions, 1, config.min_margin),
+            se3.inverse(forward),
+            types,
+            views[0],
+            config,
+            seed=seed + 1,
+            backend=backend,
+            device=device,
         )
         result = torch.stack([average_motion(a, se3.inverse(b)) for a, b in zip(forward, backward)])
     return PartMotions(motions.types, result, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
@@ -136,8 +161,12 @@ def refine(states, motions: PartMotions, views, config: PolishConfig, *, seed: i
 
 def explanation_cost(states, motions: PartMotions, views, level: int, backend: str, device="cpu") -> float:
     """Image loss of each state's Gaussians moved into the other state's photographs, both directions averaged."""
-    there = photometric_cost(states[0].gaussians, motions.labels[0], motions.transforms, views[1], level=level, backend=backend, device=device)
-    back = photometric_cost(states[1].gaussians, motions.labels[1], se3.inverse(motions.transforms), views[0], level=level, backend=backend, device=device)
+    there = photometric_cost(
+        states[0].gaussians, motions.labels[0], motions.transforms, views[1], level=level, backend=backend, device=device
+    )
+    back = photometric_cost(
+        states[1].gaussians, motions.labels[1], se3.inverse(motions.transforms), views[0], level=level, backend=backend, device=device
+    )
     return 0.5 * (there + back)
 
 
@@ -195,7 +224,9 @@ def without_part(motions: PartMotions, index: int, into: int) -> PartMotions:
         renumber[old + 1] = new + 1
     renumber[index + 1] = renumber[into]
     labels = [renumber[l] for l in motions.labels]
-    return PartMotions([motions.types[k] for k in keep], motions.transforms[keep], motions.confidence[keep], labels, motions.margin, motions.diagnostics)
+    return PartMotions(
+        [motions.types[k] for k in keep], motions.transforms[keep], motions.confidence[keep], labels, motions.margin, motions.diagnostics
+    )
 
 
 def settle_types(states, motions: PartMotions, views, config: PartMotionsConfig, *, seed: int, backend: str, device="cpu") -> PartMotions:
@@ -213,7 +244,9 @@ def settle_types(states, motions: PartMotions, views, config: PartMotionsConfig,
         types = [*motions.types[:k], "prismatic", *motions.types[k + 1 :]]
         other = PartMotions(types, slide, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
         other = refine(states, other, views, config.coarse, seed=seed, backend=backend, device=device)
-        if explanation_cost(states, other, views, level, backend, device) <= explanation_cost(states, motions, views, level, backend, device) * (1 + config.freedom_penalty):
+        if explanation_cost(states, other, views, level, backend, device) <= explanation_cost(
+            states, motions, views, level, backend, device
+        ) * (1 + config.freedom_penalty):
             motions = other
     return motions
 

@@ -139,7 +139,9 @@ class Phase(LightningModule):
             total = value if total is None else total + value
         if total is None or not total.requires_grad:
             on = ", ".join(self.losses) or "none"
-            raise UserError(f"phases.{self.phase_name}.losses: no loss applies at step {inputs.step} (switched on: {on}); expected at least 'render'")
+            raise UserError(
+                f"phases.{self.phase_name}.losses: no loss applies at step {inputs.step} (switched on: {on}); expected at least 'render'"
+            )
         self.scalars["loss/total"] = total.detach()
         return total
 

@@ -80,7 +80,17 @@ class MovedGaussians:
     def render(self, means: Tensor, quats: Tensor, sh: Tensor, camera: Camera, background: Tensor, backend: str):
         camera, background = camera.to(self.device), background.to(self.device)
         return rasterize(
-            means, quats, self.scales, self.opacities, sh, camera.viewmat, camera.K, camera.width, camera.height, background=background, backend=backend
+            means,
+            quats,
+            self.scales,
+            self.opacities,
+            sh,
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            background=background,
+            backend=backend,
         )
 
 

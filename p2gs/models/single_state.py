@@ -150,7 +150,9 @@ class SingleStatePhase(ImagePhase):
 
     Config = SingleStateConfig
 
-    def __init__(self, config: SingleStateConfig, losses: dict[str, Loss], scene: TwoStateScene, state: int, views: TrainingViews, **common):
+    def __init__(
+        self, config: SingleStateConfig, losses: dict[str, Loss], scene: TwoStateScene, state: int, views: TrainingViews, **common
+    ):
         super().__init__(config, losses, {state: views}, **common)
         self.state = state
         self.seed = self.seed * 2 + state

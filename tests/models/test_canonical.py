@@ -88,7 +88,10 @@ def test_fused_gaussians_meet_both_states_along_the_screw(beta, fusion):
         posed = carry(fused.gaussians, fused.labels, se3.screw_at(T, state - fused.canonical_times))
         distance = torch.cdist(posed.means, truth.means).amin(1)
         assert distance.max() < 0.03
-    moved = torch.cdist(se3.apply(motions.transforms[0].float(), fused.mu0[fused.paired & (fused.labels == 1)]), fused.mu1[fused.paired & (fused.labels == 1)])
+    moved = torch.cdist(
+        se3.apply(motions.transforms[0].float(), fused.mu0[fused.paired & (fused.labels == 1)]),
+        fused.mu1[fused.paired & (fused.labels == 1)],
+    )
     assert moved.diagonal().median() < 0.1
     assert int(fused.paired.sum()) > 100
 

@@ -9,7 +9,9 @@ from p2gs.models.splats import Splats, gather
 
 
 def trained(n: int = 6) -> tuple[Splats, torch.optim.Adam]:
-    splats = Splats(random_gaussians(n), extra={"psi": torch.arange(n * 2.0).reshape(n, 2)}, carried={"mu0": torch.arange(n * 3.0).reshape(n, 3)})
+    splats = Splats(
+        random_gaussians(n), extra={"psi": torch.arange(n * 2.0).reshape(n, 2)}, carried={"mu0": torch.arange(n * 3.0).reshape(n, 3)}
+    )
     optimizer = torch.optim.Adam([{"params": [p], "name": name} for name, p in splats.named_parameters()], lr=0.1)
     for _ in range(3):
         optimizer.zero_grad()

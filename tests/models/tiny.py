@@ -12,7 +12,9 @@ def random_gaussians(n: int, seed: int = 0, degree: int = 1) -> GaussianTensors:
     g = torch.Generator().manual_seed(seed)
     sh = 0.3 * torch.randn(n, (degree + 1) ** 2, 3, generator=g)
     quats = torch.randn(n, 4, generator=g)
-    return GaussianTensors(torch.randn(n, 3, generator=g), quats, -3 + 0.2 * torch.randn(n, 3, generator=g), torch.randn(n, generator=g), sh)
+    return GaussianTensors(
+        torch.randn(n, 3, generator=g), quats, -3 + 0.2 * torch.randn(n, 3, generator=g), torch.randn(n, generator=g), sh
+    )
 
 
 def textured_panels(n: int = 600) -> tuple[GaussianTensors, torch.Tensor]:
@@ -45,7 +47,9 @@ def look_at(eye: torch.Tensor, size: int) -> Camera:
     return Camera(viewmat, K, size, size)
 
 
-def photographs(g: GaussianTensors, labels: torch.Tensor, transform: torch.Tensor, state: int, size: int = 64, count: int = 8) -> list[View]:
+def photographs(
+    g: GaussianTensors, labels: torch.Tensor, transform: torch.Tensor, state: int, size: int = 64, count: int = 8
+) -> list[View]:
     """Views on a ring of the panels with part 1 moved by ``transform``."""
     body = MovedGaussians(g, labels)
     means, quats, sh = body.moved(transform[None])
