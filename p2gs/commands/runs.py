@@ -21,16 +21,19 @@ def finished_run(folder: str) -> Path:
 
 
 def test(args: argparse.Namespace) -> int:
-    """Score a run, write metrics.json, print the figures."""
+    """Score a run, write metrics.json, print the figures; a report.html that is there is written anew, now with scores."""
     from rich import print as rich_print
 
     from p2gs.callbacks.hparams import write_hparams
     from p2gs.export.evaluate import evaluate_run
+    from p2gs.export.report import write_report
     from p2gs.export.score_table import score_tables
 
     run = finished_run(args.run)
     rich_print(score_tables(evaluate_run(run, args.root)))
     write_hparams(run)
+    if (run / "report.html").is_file():
+        write_report(run)
     print(f"written: {run / 'metrics.json'}")
     return 0
 

@@ -124,9 +124,11 @@ def test_test_scores_a_run_and_prints_it(twin, tmp_path, capsys):
     scene = tmp_path / "scene"
     assert main(["data", "synth", str(scene), "--size", "48", "--views", "6", "--test_views", "1", "--kind", "demo"]) == 0
     (run / "config.yaml").write_text(f"data: {{format: artgs, root: {scene}}}\n")
+    (run / "report.html").write_text("as the fit left it")
     capsys.readouterr()
     assert main(["test", str(run)]) == 0
     out = capsys.readouterr().out
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["num_parts"] == 2 and len(metrics["joints"]["joints"]) == 2 and metrics["joints"]["failures"] >= 1
     assert "axis angle" in out and "PSNR" in out and "metrics.json" in out
+    assert "<h2>Scores</h2>" in (run / "report.html").read_text()
