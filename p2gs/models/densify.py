@@ -20,7 +20,8 @@ def densify(
     split_scale: float = 0.01,
     max_growth: float = 0.15,
 ) -> tuple[int, int]:
-    """Prune Gaussians that are faint, huge or in no view since the last call, then grow towards ``target`` by copying those with the largest mean screen gradient.
+    """Prune Gaussians that are faint, huge or in no view since the last call, then grow towards ``target`` by
+    copying those with the largest mean screen gradient.
 
     Gaussians larger than ``split_scale`` (internal units, largest axis) are split: both copies are shrunk by 1.6 and the
     second is drawn from the first's density; smaller ones are cloned in place with both opacities lowered so that the pair is

@@ -27,7 +27,7 @@ class PartScrews(nn.Module):
 
 
 def initial_screws(kind: str, parts: int, generator: torch.Generator) -> Tensor:
-    """Start transforms [K-1, 4, 4]: "identity" (with noise of 0.01) or "random" (paper section 4.3: random rotations, small translations)."""
+    """Start transforms [K-1, 4, 4]: "identity" (with noise of 0.01) or "random" (paper section 4.3: rotations at random)."""
     noise = torch.randn(parts - 1, 6, generator=generator)
     if kind == "identity":
         return se3.exp(1e-2 * noise)

@@ -127,7 +127,7 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
 def refine(
     states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu", types=None, both: bool = True
 ) -> PartMotions:
-    """Photometric refinement of all motions: start Gaussians into the end images, then end Gaussians into the start images; the mean of both."""
+    """Photometric refinement of all motions: start into end images, then end into start images; the mean."""
     if config.steps <= 0 or len(motions) == 0:
         return motions
     types = types or motions.types
@@ -223,7 +223,7 @@ def without_part(motions: PartMotions, index: int, into: int) -> PartMotions:
     for new, old in enumerate(keep):
         renumber[old + 1] = new + 1
     renumber[index + 1] = renumber[into]
-    labels = [renumber[l] for l in motions.labels]
+    labels = [renumber[old] for old in motions.labels]
     return PartMotions(
         [motions.types[k] for k in keep], motions.transforms[keep], motions.confidence[keep], labels, motions.margin, motions.diagnostics
     )

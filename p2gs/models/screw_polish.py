@@ -166,7 +166,7 @@ def polish(
     for r in rows:
         spread = (body.g.means[r] - body.g.means[r].mean(0)).norm(dim=1) if r.numel() else torch.ones(1)
         radius.append(max(float(spread.square().mean().sqrt()), 1e-3))
-    losses, gradients = [], []
+    losses = []
     for step in range(config.steps):
         fraction = step / config.steps
         generator = torch.Generator().manual_seed(seed * 1_000_003 + step)

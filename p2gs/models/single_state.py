@@ -1,4 +1,4 @@
-"""Reconstruct one joint state: 3D Gaussian splatting (paper section 3; Kerbl et al. 2023, DOI 10.1145/3592433) made for minutes on a CPU."""
+"""Reconstruct one joint state: 3D Gaussian splatting (paper section 3; Kerbl et al. 2023, DOI 10.1145/3592433) in CPU minutes."""
 
 from __future__ import annotations
 

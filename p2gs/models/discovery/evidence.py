@@ -96,6 +96,19 @@ class DepthStack:
             out[2, i : i + step] = behind.sum(1)
         return out[0], out[1], out[2]
 
+    def excess(self, points: Tensor, tau: float, limit: float = 8.0) -> Tensor:
+        """Mean over the views that see past a point of how far they do, in units of tau, at most ``limit``; 0 where none does. [N]"""
+        views = torch.arange(len(self))
+        out = points.new_zeros(len(points))
+        step = max(1, (1 << 20) // len(self))
+        near = self.near.reshape(-1)
+        for i in range(0, len(points), step):
+            z, index, inside = self.project(points[i : i + step], views)
+            past = (near[index] - z) / tau
+            free = inside & (past > 1)
+            out[i : i + step] = torch.where(free, past.clamp_max(limit), torch.zeros_like(past)).sum(1) / free.sum(1).clamp_min(1)
+        return out
+
 
 def classify(free: Tensor, on: Tensor, need: float = 3.0, ratio: float = 1.5) -> tuple[Tensor, Tensor]:
     """Votes -> (moved, static): moved when at least ``need`` views see through and ``ratio`` times more than see a surface."""

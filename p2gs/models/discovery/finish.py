@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from p2gs.models.discovery.hypotheses import balanced
 from p2gs.models.discovery.labels import Graph, Labelling, label
 from p2gs.models.discovery.problem import Problem, spread_sample
 from p2gs.models.discovery.refine import gauss_newton, pattern_search
@@ -55,14 +54,13 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
     """
     samples = part_samples(problem, labelling, k, n, moved_only=False)
     m = motions[k : k + 1]
-    if min(len(s) for s in samples) < 8:
+    if max(len(s) for s in samples) < 8:
         return m
-    weights = [torch.full((len(s),), 1.0 / len(s)) for s in samples]
+    weights = [torch.full((len(s),), 1.0 / max(1, len(s))) for s in samples]
     tp = problem.scale.tp
 
     def gain(m: Motions) -> Tensor:
-        out = [(1 - problem.cost(m, s, samples[s])[0]).mean(1) for s in (0, 1)]
-        return balanced(out[0], out[1])
+        return sum((1 - problem.cost(m, s, samples[s])[0]).mean(1) for s in (0, 1) if len(samples[s]) >= 8)
 
     def sharpen(m: Motions) -> tuple[Motions, Tensor]:
         m, v = pattern_search(gain, m, 0.3 * tp, 10)
@@ -71,7 +69,7 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
         return (fine, w) if float(w) > float(v) - 0.01 else (m, v)
 
     free, value = sharpen(m)
-    middle = problem.surfels[0].points[samples[0]].mean(0)
+    middle = problem.surfels[0].points[samples[0]].mean(0) if len(samples[0]) else free.apply(problem.surfels[1].points[samples[1]], True)[0].mean(0)
     on_axis = snapped(problem, free, middle, axes)
     if len(on_axis):
         on_axis, v = pattern_search(gain, on_axis, 0.5 * tp, 10, tilt=False)

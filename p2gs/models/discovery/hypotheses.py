@@ -110,18 +110,14 @@ class Sweep:
         w = torch.zeros(n + len(weights[1]), 2)
         w[:n, 0], w[n:, 1] = weights[0] / 255, weights[1] / 255
         g = torch.cat([self.evidence[i : i + chunk].float() @ w for i in range(0, len(self.evidence), chunk)])
-        return balanced(g[:, 0], g[:, 1])
-
-
-def balanced(a: Tensor, b: Tensor) -> Tensor:
-    """Sum of two states' gains, neither counting for more than twice the other."""
-    return torch.minimum(a, 2 * b + 0.002) + torch.minimum(b, 2 * a + 0.002)
+        a, b = g[:, 0], g[:, 1]
+        return torch.minimum(a, 3 * b + 0.03) + torch.minimum(b, 3 * a + 0.03)
 
 
 def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120000) -> Sweep:
     """Try all slides and turns about ``axes``; steps are a voxel or so of displacement.
 
-    Only motions with some evidence in both states are kept, at most ``keep`` of them.
+    Only motions with some evidence in both states, or much in one, are kept, at most ``keep`` of them.
     """
     cfg, diag = problem.config, problem.scale.diag
     landings = problem.landings
@@ -143,9 +139,11 @@ def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120
 
     kept: list[tuple[Motions, Tensor]] = []
 
+    n = len(samples[0])
+
     def keep_good(motions: Motions, q: Tensor, least: float = 0.02) -> None:
-        n = len(samples[0])
-        ok = (q[:, :n].float().mean(1) > 255 * least) & (q[:, n:].float().mean(1) > 255 * least)
+        a, b = q[:, :n].float().mean(1) / 255, q[:, n:].float().mean(1) / 255
+        ok = (torch.minimum(a, b) > least) | (torch.maximum(a, b) > 3 * least)
         kept.append((motions[ok], q[ok]))
 
     amounts = torch.arange(1.0, cfg.max_slide * diag / (0.8 * hc)) * 0.8 * hc

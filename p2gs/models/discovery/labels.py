@@ -36,7 +36,10 @@ class Graph:
 
 
 def unary(problem: Problem, motions: Motions, state: int) -> Tensor:
-    """Cost [N, K + 1] of every surfel of ``state`` under static (column 0) and each motion."""
+    """Cost [N, K + 1] of every surfel of ``state`` under static (column 0) and each motion.
+
+    A surfel that a motion lays on a surface known to have moved is wanted there: that surface must come from somewhere.
+    """
     n = len(problem.surfels[state])
     moved, static = problem.moved[state], problem.static[state]
     rest = torch.full((n,), 0.22)
@@ -44,9 +47,12 @@ def unary(problem: Problem, motions: Motions, state: int) -> Tensor:
     rest[moved] = 1.0
     columns = [rest]
     index = torch.arange(n)
+    wanted = torch.zeros(n, dtype=torch.bool)
     for k in range(len(motions)):
-        c = problem.cost(motions[k : k + 1], state, index)[0][0]
+        c, j = (x[0] for x in problem.cost(motions[k : k + 1], state, index))
         columns.append(c + torch.where(moved, 0.0, 0.06))
+        wanted |= (c < 0.2) & problem.moved[1 - state][j]
+    columns[0] = torch.where(wanted & ~moved, torch.where(static, 0.2, 0.45), columns[0])
     return torch.stack(columns, 1)
 
 

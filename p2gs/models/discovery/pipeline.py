@@ -55,7 +55,7 @@ def discover(
     lap("evidence", 0.2)
     graphs = [Graph.build(s.points, s.normals, s.colours) for s in problem.surfels]
     explanations: list[Explanation] = []
-    if limit > 0 and min(len(s) for s in problem.samples) >= config.min_moved:
+    if limit > 0 and max(len(s) for s in problem.samples) >= config.min_moved:
         axes = directions(problem)
         swept = sweep(problem, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in problem.samples])
         still = static_axes(problem)
@@ -111,7 +111,7 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
         motions = motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
         motions, labelling = settle_parts(problem, graphs, motions, axes, rounds=1)
     mass = masses(problem, labelling)
-    pays = [p for p in problem.pay(motions)] if len(motions) else []
+    pays = [p for p, _ in problem.pay(motions)] if len(motions) else []
     doubt = float((torch.tensor(mass) * (1 - plausibility(problem, motions, pays, problem.samples))).sum()) if len(motions) else 0.0
     score = image_score(problem, motions, labelling) + cfg.part_cost * len(motions) + 0.5 * doubt
     return Explanation(motions, labelling, value, score)
@@ -128,9 +128,9 @@ def masses(problem: Problem, labelling: Labelling) -> list[float]:
     K = labelling.probability[0].shape[1] - 1
     out = torch.zeros(K)
     for s in (0, 1):
-        labels = labelling.labels(s)[problem.moved[s]]
-        if len(labels):
-            out += torch.bincount(labels, minlength=K + 1)[1:] / len(labels) / 2
+        w = problem.trust[s] * problem.moved[s]
+        if float(w.sum()) > 0:
+            out += torch.zeros(K + 1).index_add(0, labelling.labels(s), w)[1:] / w.sum() / 2
     return out.tolist()
 
 
@@ -139,7 +139,7 @@ def describe(problem: Problem, e: Explanation, start: StateEvidence, end: StateE
     found = []
     mass = masses(problem, e.labelling)
     bad = [violation(problem, e.motions, e.labelling.labels(s), s) for s in (0, 1)]
-    pays = problem.pay(e.motions) if len(e.motions) else []
+    pays = [p for p, _ in problem.pay(e.motions)] if len(e.motions) else []
     plausible = plausibility(problem, e.motions, pays, problem.samples) if len(e.motions) else torch.zeros(0)
     for k in range(len(e.motions)):
         T = e.motions.transform(k)

@@ -21,7 +21,10 @@ SOFT = 0.10
 
 @dataclass
 class Problem:
-    """surfels, stacks, landings, moved and static masks by state; ``samples``: indices of the moved surfels the search looks at."""
+    """surfels, stacks, landings, moved and static masks by state; ``samples``: indices of the moved surfels the search looks at.
+
+    trust [N] per state, 0.1..1: how credible it is that a moved surfel moved; ``weights`` [P] per state: that of the samples, sum 1.
+    """
 
     config: DiscoveryConfig
     scale: Scale
@@ -31,6 +34,8 @@ class Problem:
     static: list[Tensor]
     landings: list[Landing]
     samples: list[Tensor]
+    weights: list[Tensor]
+    trust: list[Tensor]
     centre: Tensor
 
     def points(self, state: int) -> Tensor:
@@ -44,14 +49,33 @@ class Problem:
             motions.apply(s.points[index], back), motions.rotate(s.normals[index], back), s.colours[index], claimed
         )
 
-    def pay(self, motions: Motions, samples: list[Tensor] | None = None, chunk: int = 64) -> list[Tensor]:
-        """Evidence [B, P] by state: how much below ``unexplained`` a point costs; only true arrivals on a surface pay."""
+    def pay(self, motions: Motions, samples: list[Tensor] | None = None, chunk: int = 64) -> list[tuple[Tensor, Tensor]]:
+        """Evidence [B, P] by state: how much below ``unexplained`` a point costs; only true arrivals on a surface pay. With it, whether
+        [B, P] the point arrives on a surface that is neither known to have moved nor to have stayed."""
         samples = self.samples if samples is None else samples
         out = []
-        for state in (0, 1):
-            rows = [paid(self.cost(motions[i : i + chunk], state, samples[state])[0], self.config.unexplained) for i in range(0, len(motions), chunk)]
-            out.append(torch.cat(rows) if rows else torch.zeros(0, len(samples[state])))
+        for s in (0, 1):
+            pays, loose = [torch.zeros(0, len(samples[s]))], [torch.zeros(0, len(samples[s]), dtype=torch.bool)]
+            for i in range(0, len(motions), chunk):
+                cost, j = self.cost(motions[i : i + chunk], s, samples[s])
+                pays.append(paid(cost, self.config.unexplained))
+                loose.append(self.loose(1 - s, j))
+            out.append((torch.cat(pays), torch.cat(loose)))
         return out
+
+    def loose(self, state: int, index: Tensor) -> Tensor:
+        """Are these surfels of ``state`` of unknown fate?"""
+        return ~(self.moved[state][index] | self.static[state][index])
+
+
+def balanced(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:
+    """Evidence of both states together, each given as (on surfaces of known fate, on surfaces of unknown fate).
+
+    What arrives on a moved surface must be answered from there, so neither state's counts for over three times the other's; a surface
+    of unknown fate (hidden from the other state, or wrongly rebuilt there) cannot answer.
+    """
+    a, b = start[0] + start[1], end[0] + end[1]
+    return torch.minimum(start[0], 3 * b + 0.001) + torch.minimum(end[0], 3 * a + 0.001) + start[1] + end[1]
 
 
 def paid(cost: Tensor, unexplained: float) -> Tensor:
@@ -80,6 +104,23 @@ def evidence_masks(surfels: list[Surfels], stacks: list[DepthStack], tau: float)
         moved.append(m)
         static.append(still & like.any(1) & ~m)
     return moved, static
+
+
+def credibility(surfels: Surfels, other: Surfels, stack: DepthStack, moved: Tensor, scale: Scale) -> Tensor:
+    """[N] 0.1..1: moved surfels that are only just seen through, or have a like surface close by in the other state, may be errors."""
+    index = torch.nonzero(moved)[:, 0]
+    out = torch.full((len(surfels),), 0.1)
+    if not len(index):
+        return out
+    p, n = surfels.points[index], surfels.normals[index]
+    far = ((stack.excess(p, scale.tau) - 1.3) / 2.0).clamp(0.1, 1)
+    j = torch.from_numpy(np.asarray(cKDTree(other.points.numpy()).query(p.numpy(), k=min(24, len(other)))[1]).reshape(len(p), -1))
+    d = other.points[j] - p[:, None]
+    across = (d * n[:, None]).sum(2).abs()
+    along = (d.pow(2).sum(2) - across**2).clamp_min(0).sqrt()
+    like = ((other.normals[j] * n[:, None]).sum(2) > 0.7) & (along < 2 * scale.spacing) & (across < 1.3 * scale.tp)
+    out[index] = far * torch.where(like.any(1), 0.5, 1.0)
+    return out.clamp_min(0.1)
 
 
 def disagreement(surfels: list[Surfels], limit: float) -> float:
@@ -112,7 +153,9 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
     for s in (0, 1):
         index = torch.nonzero(moved[s])[:, 0]
         samples.append(index[spread_sample(surfels[s].points[index], config.samples, g)])
-    problem = Problem(config, scale, stacks, surfels, moved, static, landings, samples, (lo + hi) / 2)
+    trust = [credibility(surfels[s], surfels[1 - s], stacks[1 - s], moved[s], scale) for s in (0, 1)]
+    weights = [trust[s][samples[s]] / trust[s][samples[s]].sum().clamp_min(1e-9) for s in (0, 1)]
+    problem = Problem(config, scale, stacks, surfels, moved, static, landings, samples, weights, trust, (lo + hi) / 2)
     figures = {
         "diag": diag,
         "noise": noise,

@@ -8,8 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from p2gs.models.discovery.hypotheses import balanced
-from p2gs.models.discovery.problem import Problem, paid
+from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.rigid import Motions
 
 
@@ -54,24 +53,6 @@ def gauss_newton(problem: Problem, motions: Motions, samples: list[Tensor], weig
         limit = torch.cat([torch.full((1,), 2 * hc), torch.full((2,), 0.08), torch.full((2,), 2 * hc)])
         motions = motions.displaced(torch.maximum(torch.minimum(step, limit), -limit))
     return motions
-
-
-class Gain:
-    """Evidence for one more motion given what each point costs already: [B] from motions [B]."""
-
-    def __init__(self, problem: Problem, samples: list[Tensor], weights: list[Tensor], paid_already: list[Tensor] | None = None):
-        self.problem, self.samples, self.weights, self.already = problem, samples, weights, paid_already
-
-    def pay(self, motions: Motions) -> list[Tensor]:
-        return self.problem.pay(motions, self.samples)
-
-    def __call__(self, motions: Motions) -> Tensor:
-        total = []
-        for s, p in enumerate(self.pay(motions)):
-            if self.already is not None:
-                p = (p - self.already[s]).clamp_min(0)
-            total.append(p @ self.weights[s])
-        return balanced(total[0], total[1])
 
 
 def pattern_search(

@@ -15,8 +15,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from p2gs.models.discovery.hypotheses import Sweep, balanced, distinct
-from p2gs.models.discovery.problem import Problem
+from p2gs.models.discovery.hypotheses import Sweep, distinct
+from p2gs.models.discovery.problem import Problem, balanced
 from p2gs.models.discovery.refine import gauss_newton, pattern_search
 from p2gs.models.discovery.rigid import Motions
 
@@ -60,7 +60,8 @@ class Pool:
 
     pays [B, P0], [B, P1] in 0..1: saturated (a sharper fit of what is explained already is worth nothing here), averaged over a
     point's neighbours that face alike, times the joint's plausibility.  twin [B, P]: the sample of the other state next to where the
-    point lands.  back [B, P]: what that sample pays under the same motion.
+    point lands.  back [B, P]: what that sample pays under the same motion.  owned, loose [B, P]: does the point land on a moved surface,
+    on one of unknown fate.
     """
 
     FULL, NONE = 0.16, 0.30  # landing costs that pay all and nothing
@@ -74,6 +75,8 @@ class Pool:
         self.pays = [torch.zeros(0, len(s)) for s in samples]
         self.twin = [torch.zeros(0, len(s), dtype=torch.long) for s in samples]
         self.back = [torch.zeros(0, len(s)) for s in samples]
+        self.owned = [torch.zeros(0, len(s), dtype=torch.bool) for s in samples]
+        self.loose = [torch.zeros(0, len(s), dtype=torch.bool) for s in samples]
         self.smooth, self.closest = [], []
         for s in (0, 1):
             surf = problem.surfels[s]
@@ -96,8 +99,10 @@ class Pool:
                 raw.append(fit)
                 hidden.append((cost < 0.45).float())
                 twin.append(self.closest[1 - s][j])
+                self.owned[s] = torch.cat([self.owned[s], self.problem.moved[1 - s][j]])
+                self.loose[s] = torch.cat([self.loose[s], self.problem.loose(1 - s, j)])
             f = plausibility(self.problem, m, raw, self.samples)[:, None]
-            trust = (sum(r.mean(1) for r in raw if r.shape[1]) / 0.1).clamp(0, 1)[:, None]
+            trust = (self.mean(raw) / 0.1).clamp(0, 1)[:, None]
             local = [((raw[s] @ self.smooth[s] - 0.25) / 0.5).clamp(0, 1) for s in (0, 1)]
             pays = [torch.maximum(local[s], self.HIDDEN * trust * (hidden[s] @ self.smooth[s])) * f for s in (0, 1)]
             for s in (0, 1):
@@ -115,7 +120,8 @@ class Pool:
         """Evidence [R, P] of motions ``rows``, less where the landing place is better explained otherwise (``others`` [P] per state)."""
         out = []
         for s in (0, 1):
-            rival = others[1 - s][self.twin[s][rows]]
+            rival = others[1 - s][self.twin[s][rows]] if len(others[1 - s]) else torch.zeros_like(self.back[s][rows])
+            rival = torch.where(self.owned[s][rows], rival, torch.zeros_like(rival))
             fits = (1 - (rival - self.back[s][rows]) / self.RIVAL).clamp(0, 1)
             out.append(self.pays[s][rows] * (1 - self.SHARED * (1 - fits)))
         return out
@@ -128,28 +134,35 @@ class Pool:
         return [x.max(0).values for x in e]
 
     def total(self, chosen) -> float:
-        """Evidence, 0..1: every point goes to the motion that pays most; of a part, neither state counts for over three times the other."""
+        """Evidence, 0..1: every point goes to the motion that pays most, both states weighted alike, each part's evidence balanced."""
         if not len(chosen):
             return 0.0
+        rows = torch.tensor(list(chosen))
         share = []
-        for e in self.effective(torch.tensor(list(chosen)), self.best(chosen)):
+        for s, e in enumerate(self.effective(rows, self.best(chosen))):
             value, who = e.max(0)
-            share.append(torch.zeros(len(chosen)).index_add_(0, who, value) / max(1, e.shape[1]))
-        a, b = share
-        return float((torch.minimum(a, 3 * b + 0.001) + torch.minimum(b, 3 * a + 0.001)).sum()) / 2
+            value = value * self.problem.weights[s]
+            loose = self.loose[s][rows].gather(0, who[None])[0]
+            zero = torch.zeros(len(chosen))
+            share.append((zero.index_add(0, who, value * ~loose), zero.index_add(0, who, value * loose)))
+        return float(balanced(*share).sum()) / 2
+
+    def mean(self, e: list[Tensor]) -> Tensor:
+        """Weighted mean [B] over both states of evidence [B, P0], [B, P1]."""
+        return sum(x @ w for x, w in zip(e, self.problem.weights))
 
 
 class ExclusiveGain:
     """Plausible, unsaturated evidence of motions [B] over what others leave, ``left`` [P] per state in 0..1."""
 
     def __init__(self, problem: Problem, samples: list[Tensor], left: list[Tensor]):
-        self.problem, self.samples, self.left = problem, samples, left
+        self.problem, self.samples = problem, samples
+        self.weights = [w * x for w, x in zip(problem.weights, left)]
 
     def __call__(self, motions: Motions) -> Tensor:
         pays = self.problem.pay(motions, self.samples)
-        f = plausibility(self.problem, motions, pays, self.samples)
-        g = [f * (p @ w) / max(1, len(w)) for p, w in zip(pays, self.left)]
-        return balanced(g[0], g[1])
+        f = plausibility(self.problem, motions, [p for p, _ in pays], self.samples)
+        return f * balanced(*[((p * ~u) @ w, (p * u) @ w) for (p, u), w in zip(pays, self.weights)])
 
 
 class Search:
@@ -168,7 +181,7 @@ class Search:
     def propose(self, chosen: list[int], count: int, fine: int, extra: Motions | None = None) -> tuple[Motions, Tensor]:
         """The ``fine`` best sharpened motions for what the motions ``chosen`` leave over, and their gains."""
         left = [(1 - a).clamp(0, 1) for a in self.pool.explained(chosen)]
-        weights = [w[r] / max(1, len(r)) for w, r in zip(left, self.sweep_rows)]
+        weights = [(x * w)[r] / w[r].sum().clamp_min(1e-9) for x, w, r in zip(left, self.problem.weights, self.sweep_rows)]
         g = self.swept.gain(weights)
         slide = ~self.swept.motions.turn
         tops = [distinct(self.swept.motions, torch.where(kind, g, -torch.ones_like(g)), self.probe, self.radius, n) for kind, n in ((slide, count // 3), (~slide, count))]
@@ -179,7 +192,7 @@ class Search:
         if len(motions) == 0:
             return motions, torch.zeros(0)
         gain = ExclusiveGain(self.problem, self.samples, left)
-        sharp = gauss_newton(self.problem, motions, self.samples, [w / max(1, len(w)) for w in left])
+        sharp = gauss_newton(self.problem, motions, self.samples, [w * x for w, x in zip(self.problem.weights, left)])
         both = Motions.cat([motions, sharp])
         value = gain(both)
         n = len(motions)
@@ -214,7 +227,7 @@ class Search:
         already, best = self.pool.explained(rest), self.pool.best(rest)
         rows = torch.arange(len(self.pool.motions))
         e = self.pool.effective(rows, best)
-        guess = sum((e[s] - already[s]).clamp_min(0).mean(1) for s in (0, 1) if e[s].shape[1])
+        guess = self.pool.mean([(x - a).clamp_min(0) for x, a in zip(e, already)])
         return [(self.value([*rest, k]), [*rest, k]) for k in guess.topk(min(top, len(guess))).indices.tolist() if k not in rest]
 
     def improve(self, chosen: list[int]) -> list[int]:
@@ -274,7 +287,7 @@ class Search:
             far = m[torch.tensor([k])].swept(self.probe, m)[0] > 3 * self.radius
             already, best = self.pool.explained(rest), self.pool.best(rest)
             e = self.pool.effective(torch.arange(len(m)), best)
-            guess = sum((e[s] - already[s]).clamp_min(0).mean(1) for s in (0, 1) if e[s].shape[1])
+            guess = self.pool.mean([(x - a).clamp_min(0) for x, a in zip(e, already)])
             guess = torch.where(far, guess, torch.full_like(guess, -1.0))
             options = [(self.value([*rest, i]), [*rest, i]) for i in guess.topk(min(4, len(guess))).indices.tolist() if far[i]]
             if options:

@@ -34,5 +34,6 @@ def image_score(problem: Problem, motions: Motions, labelling: Labelling) -> flo
         labels = labelling.labels(s)
         about = problem.moved[s] | (labels > 0)
         if about.any():
-            total.append(float(violation(problem, motions, labels, s)[about].mean()))
+            w = torch.where(problem.moved[s], problem.trust[s], torch.full_like(problem.trust[s], 0.3))[about]
+            total.append(float((violation(problem, motions, labels, s)[about] * w).sum() / w.sum()))
     return sum(total) / len(total) if total else 0.0
