@@ -6,20 +6,36 @@
 #include <new>
 
 #include "kernels.h"
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 #include "pool.h"
 
 namespace p2gs {
 namespace {
 
+// Memory for `bytes`, to be given back by std::free. Large pieces ask for huge pages: the tiles read them in random order.
+void* allocate(size_t bytes) {
+    constexpr size_t huge = size_t(2) << 20;
+    const size_t unit = bytes >= huge ? huge : 64;
+    bytes = (bytes + unit - 1) / unit * unit;
+    void* p = std::aligned_alloc(unit, bytes);
+    if (!p) throw std::bad_alloc();
+#if defined(__linux__)
+    if (unit == huge) madvise(p, bytes, MADV_HUGEPAGE);  // a hint: whether it is taken does not matter
+#endif
+    return p;
+}
+
+// Contents are lost when it grows.
 template <class T>
 void reserve(T*& data, size_t& capacity, size_t wanted) {
     if (wanted <= capacity) return;
     std::free(data);
     data = nullptr;
     capacity = 0;
-    size_t grown = wanted + wanted / 4 + 64;
-    data = static_cast<T*>(std::aligned_alloc(64, (grown * sizeof(T) + 63) / 64 * 64));
-    if (!data) throw std::bad_alloc();
+    const size_t grown = wanted + wanted / 4 + 64;
+    data = static_cast<T*>(allocate(grown * sizeof(T)));
     capacity = grown;
 }
 
