@@ -15,7 +15,7 @@ from p2gs.models.discovery.config import DiscoveryConfig
 from p2gs.models.discovery.evidence import StateEvidence
 from p2gs.models.discovery.finish import Explanation, settle_parts, split_amounts, with_amounts
 from p2gs.models.discovery.hypotheses import directions, static_axes, sweep
-from p2gs.models.discovery.labels import Graph, Labelling
+from p2gs.models.discovery.labels import Graph, Labelling, label
 from p2gs.models.discovery.problem import Problem, build_problem
 from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
 from p2gs.models.discovery.rigid import Motions
@@ -110,11 +110,33 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
             break
         motions = motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
         motions, labelling = settle_parts(problem, graphs, motions, axes, rounds=1)
-    mass = masses(problem, labelling)
-    pays = [p for p, _ in problem.pay(motions)] if len(motions) else []
-    doubt = float((torch.tensor(mass) * (1 - plausibility(problem, motions, pays, problem.samples))).sum()) if len(motions) else 0.0
-    score = image_score(problem, motions, labelling) + cfg.part_cost * len(motions) + 0.5 * doubt
+    return prune(problem, graphs, motions, labelling, value, axes)
+
+
+def prune(problem: Problem, graphs: list[Graph], motions: Motions, labelling: Labelling, value: float, axes: Tensor) -> Explanation:
+    """Drop parts, the least needed first, while the explanation of both states' images gets no worse without them."""
+    score = total_score(problem, motions, labelling)
+    while len(motions) > 1:
+        tried = []
+        for k in range(len(motions)):
+            fewer = motions[torch.tensor([i for i in range(len(motions)) if i != k])]
+            relabelled = label(problem, fewer, graphs)
+            tried.append((total_score(problem, fewer, relabelled), k, fewer))
+        least, _, fewer = min(tried, key=lambda t: t[:2])
+        if least > score:
+            break
+        motions, labelling = settle_parts(problem, graphs, fewer, axes, rounds=1)
+        score = total_score(problem, motions, labelling)
     return Explanation(motions, labelling, value, score)
+
+
+def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> float:
+    """Image-space violation, the price of every part and half of the moved surface that hangs on implausible joints. Lower is better."""
+    if not len(motions):
+        return image_score(problem, motions, labelling)
+    pays = [p for p, _ in problem.pay(motions)]
+    doubt = float((torch.tensor(masses(problem, labelling)) * (1 - plausibility(problem, motions, pays, problem.samples))).sum())
+    return image_score(problem, motions, labelling) + problem.config.part_cost * len(motions) + 0.5 * doubt
 
 
 def same_motion(problem: Problem, motions: Motions, i: int, j: int) -> bool:

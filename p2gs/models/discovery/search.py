@@ -26,11 +26,12 @@ def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples
 
     * A hinge touches what it carries: distance from the axis to the points that pay, less what must stay unseen near an axis.
     * A part's faces lie along or across its joint's axis: share of paying points whose normals are oblique to it.
+    * A motion of hardly more than the tolerance is what errors of the surfaces look like.
     * Large motions are a little less likely than small ones; a turn has two freedoms more than a slide.
     """
     cfg, k = problem.config, problem.scale
     near = torch.full((len(motions),), torch.inf)
-    oblique, weight = torch.zeros(len(motions)), torch.full((len(motions),), 1e-6)
+    oblique, arm, weight = torch.zeros(len(motions)), torch.zeros(len(motions)), torch.full((len(motions),), 1e-6)
     for s in (0, 1):
         surf = problem.surfels[s]
         p, n = surf.points[samples[s]], surf.normals[samples[s]]
@@ -38,6 +39,7 @@ def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples
         axis = motions.axis
         d = p[None] - motions.centre[:, None]
         away = (d - (d * axis[:, None]).sum(2, keepdim=True) * axis[:, None]).norm(dim=2)
+        arm += torch.where(pay, away, torch.zeros_like(away)).sum(1) / max(1, len(p))
         away = torch.where(pay, away, torch.full_like(away, torch.inf))
         few = max(1, int(0.01 * away.shape[1]))
         if away.shape[1]:
@@ -52,6 +54,8 @@ def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples
     size = motions.amount.abs() / (cfg.max_slide * k.diag)
     slide = (1 - 0.08 * size.clamp(0, 1)) * (1 - 2 * (size - 1).clamp(0, 0.5))
     out = torch.where(motions.turn, turn, slide)
+    reach = torch.where(motions.turn, arm / weight * motions.amount.abs(), motions.amount.abs())
+    out = out * ((reach / k.tp - 1) / 1.5).clamp(0.1, 1)
     return out * (1 - 0.4 * ((oblique / weight - 0.35) / 0.4).clamp(0, 1))
 
 
