@@ -74,7 +74,7 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
     if len(on_axis):
         on_axis, v = pattern_search(gain, on_axis, 0.5 * tp, 10, tilt=False)
         best = int(v.argmax())
-        if float(1 - v[best] / 2) < 1.04 * float(1 - value / 2) + 0.004:
+        if float(1 - v[best] / 2) < 1.08 * float(1 - value / 2) + 0.008:
             return on_axis[best : best + 1]
     return free
 

@@ -135,7 +135,7 @@ def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> flo
     if not len(motions):
         return image_score(problem, motions, labelling)
     pays = [p for p, _ in problem.pay(motions)]
-    doubt = float((torch.tensor(masses(problem, labelling)) * (1 - plausibility(problem, motions, pays, problem.samples))).sum())
+    doubt = float((torch.tensor(masses(problem, labelling)) * (1 - plausibility(problem, motions, pays, problem.samples, False))).sum())
     return image_score(problem, motions, labelling) + problem.config.part_cost * len(motions) + 0.5 * doubt
 
 
@@ -162,7 +162,7 @@ def describe(problem: Problem, e: Explanation, start: StateEvidence, end: StateE
     mass = masses(problem, e.labelling)
     bad = [violation(problem, e.motions, e.labelling.labels(s), s) for s in (0, 1)]
     pays = [p for p, _ in problem.pay(e.motions)] if len(e.motions) else []
-    plausible = plausibility(problem, e.motions, pays, problem.samples) if len(e.motions) else torch.zeros(0)
+    plausible = plausibility(problem, e.motions, pays, problem.samples, False) if len(e.motions) else torch.zeros(0)
     for k in range(len(e.motions)):
         T = e.motions.transform(k)
         turn = bool(e.motions.turn[k])

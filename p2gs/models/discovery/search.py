@@ -21,7 +21,7 @@ from p2gs.models.discovery.refine import gauss_newton, pattern_search
 from p2gs.models.discovery.rigid import Motions
 
 
-def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples: list[Tensor]) -> Tensor:
+def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples: list[Tensor], slide_bonus: bool = True) -> Tensor:
     """Factor [B] in 0..1 on a motion's evidence, from what joints of made things are like.
 
     * A hinge touches what it carries: distance from the axis to the points that pay, less what must stay unseen near an axis.
@@ -50,7 +50,7 @@ def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples
     unseen = 1.5 * k.tau / (2 * torch.sin(motions.amount.abs().clamp(0.03, math.pi) / 2))
     excess = (near - 0.04 * k.diag - unseen).clamp(0, k.diag)
     turn = 1 - cfg.attach * (excess / (0.12 * k.diag)).clamp(0, 1)
-    turn = turn * (1 - 0.15 * ((motions.amount.abs() - math.radians(80)) / math.radians(55)).clamp(0, 1)) * (1 - cfg.slide_bonus)
+    turn = turn * (1 - 0.15 * ((motions.amount.abs() - math.radians(80)) / math.radians(55)).clamp(0, 1)) * (1 - cfg.slide_bonus * slide_bonus)
     size = motions.amount.abs() / (cfg.max_slide * k.diag)
     slide = (1 - 0.08 * size.clamp(0, 1)) * (1 - 2 * (size - 1).clamp(0, 0.5))
     out = torch.where(motions.turn, turn, slide)

@@ -9,13 +9,15 @@ from p2gs.models.discovery.labels import Labelling
 from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.rigid import Motions
 
-HIDDEN = 0.35
+HIDDEN = 0.5
+STAYED = 0.25
 UNEXPLAINED = 1.0
 
 
 def violation(problem: Problem, motions: Motions, labels: Tensor, state: int, views: int = 32) -> Tensor:
     """Cost [N] in 0..1 of the labelled surfels of ``state``: share of the other state's views that see through where a point is
-    predicted, of those not blocked by something in front; 0.35 where all are blocked; 1 for a moved point that is called static."""
+    predicted, of those not blocked by something in front; 0.5 where all are blocked; 0.25 more for a point that is said to move off a
+    surface seen in both states; 1 for a moved point that is called static."""
     surf, stack = problem.surfels[state], problem.stacks[1 - state]
     x = surf.points.clone()
     for k in range(len(motions)):
@@ -24,6 +26,7 @@ def violation(problem: Problem, motions: Motions, labels: Tensor, state: int, vi
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(views))
     seen = free + on
     cost = torch.where(seen > 0, free / seen.clamp_min(1), torch.full_like(free, HIDDEN))
+    cost = torch.where((labels > 0) & problem.static[state], (cost + STAYED).clamp_max(1), cost)
     return torch.where((labels == 0) & problem.moved[state], torch.full_like(cost, UNEXPLAINED), cost)
 
 
