@@ -18,6 +18,7 @@ constexpr int kMaxFeatures = 16;
 constexpr int kSlopes = 12;        // per Gaussian and channel: 1 or 0 (not clamped, clamped), then d colour / d direction
 constexpr int kSlot = 16;          // floats of a gradient slot before the features
 constexpr float kMinAlpha = 1.0f / 255, kMaxAlpha = 0.99f, kStop = 1e-4f, kFar = 1e10f;
+constexpr float kFaint = 7.99435344f;  // -log2(kMinAlpha)
 
 // A Gaussian in the image plane. With d = pixel - (mx, my): u = l11 dx + l21 dy, v = l22 dy (Cholesky factor of the inverse
 // covariance, scaled), and alpha = 2^(lop - u^2 - v^2).
