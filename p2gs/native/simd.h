@@ -82,7 +82,6 @@ P2GS_INLINE VM le(VF a, VF b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, 
 P2GS_INLINE VM gt(VM m, VF a, VF b) { return _mm512_mask_cmp_ps_mask(m, (__m512)a, (__m512)b, _CMP_GT_OQ); }
 P2GS_INLINE VM le(VM m, VF a, VF b) { return _mm512_mask_cmp_ps_mask(m, (__m512)a, (__m512)b, _CMP_LE_OQ); }
 P2GS_INLINE VM both(VM a, VM b) { return VM(a & b); }
-P2GS_INLINE VM but_not(VM a, VM b) { return VM(a & ~b); }
 P2GS_INLINE VF zero_unless(VM m, VF a) { return (VF)_mm512_maskz_mov_ps(m, (__m512)a); }
 P2GS_INLINE VF mul_if(VM m, VF a, VF b) { return (VF)_mm512_maskz_mul_ps(m, (__m512)a, (__m512)b); }
 P2GS_INLINE VF pick(VM m, VF yes, VF no) { return (VF)_mm512_mask_mov_ps((__m512)no, m, (__m512)yes); }
@@ -170,7 +169,6 @@ P2GS_INLINE VM le(VF a, VF b) { return a <= b; }
 P2GS_INLINE VM gt(VM m, VF a, VF b) { return m & (a > b); }
 P2GS_INLINE VM le(VM m, VF a, VF b) { return m & (a <= b); }
 P2GS_INLINE VM both(VM a, VM b) { return a & b; }
-P2GS_INLINE VM but_not(VM a, VM b) { return a & ~b; }
 P2GS_INLINE VF zero_unless(VM m, VF a) { return (VF)(m & (VI)a); }
 P2GS_INLINE VF mul_if(VM m, VF a, VF b) { return (VF)(m & (VI)(a * b)); }
 #endif
