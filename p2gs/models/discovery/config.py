@@ -21,6 +21,7 @@ class DiscoveryConfig:
     slide_bonus: a slide has two degrees of freedom less than a turn: share of a part's gain in its favour.
     split, split_fixed: least share of its residual that half a part must lose with an amount of its own ("auto", below a given number).
     min_mass: least share of the moved surface of a part.  min_moved: fewest moved surfels a state below which nothing moved.
+    search_weight: weight of the search's own value beside the image-space violation when explanations are ranked.
     candidates: how many complete explanations are handed back at most.
     """
 
@@ -41,4 +42,5 @@ class DiscoveryConfig:
     split_fixed: float = 0.2
     min_mass: float = 0.015
     min_moved: int = 12
+    search_weight: float = 0.4
     candidates: int = 4

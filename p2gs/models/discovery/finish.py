@@ -74,22 +74,22 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
     if len(on_axis):
         on_axis, v = pattern_search(gain, on_axis, 0.5 * tp, 10, tilt=False)
         best = int(v.argmax())
-        if float(1 - v[best] / 2) < 1.08 * float(1 - value / 2) + 0.008:
+        if float(1 - v[best] / 2) < 1.12 * float(1 - value / 2) + 0.03:
             return on_axis[best : best + 1]
     return free
 
 
-def split_amounts(problem: Problem, labelling: Labelling, graphs: list[Graph], motions: Motions, k: int, reach: float = 4.0, steps: int = 25):
+def split_amounts(problem: Problem, labelling: Labelling, graphs: list[Graph], motions: Motions, k: int, apart: float = 0.9, steps: int = 25):
     """Do two amounts about one axis explain part k better than one?  (evidence, amount a, amount b).
 
-    Costs of every moved point over amounts within ``reach`` tolerances, averaged over neighbours. Of the best pair, the evidence is what
+    Costs of every moved point over amounts within four tolerances, averaged over neighbours. Of the best pair, the evidence is what
     the smaller half saves against the best single amount, relative to its cost, in the state where it saves less; nothing when the
-    amounts differ by less than the tolerance: that is what noise does to one part.
+    amounts differ by less than ``apart`` tolerances: that is what noise does to one part.
     """
     m = motions[k : k + 1]
     tp = problem.scale.tp
     arm = 0.2 * problem.scale.diag if bool(m.turn) else 1.0
-    delta = torch.linspace(-reach, reach, steps) * tp / arm
+    delta = torch.linspace(-4, 4, steps) * tp / arm
     many = Motions(m.turn.expand(steps), m.axis.expand(steps, 3), m.centre.expand(steps, 3), m.amount + delta)
     none = (0.0, float(m.amount), float(m.amount))
     costs = []
@@ -107,8 +107,8 @@ def split_amounts(problem: Problem, labelling: Labelling, graphs: list[Graph], m
         costs.append(full[index])
     single = sum(c.mean(0) for c in costs)
     pair = sum(torch.minimum(c[:, :, None], c[:, None, :]).mean(0) for c in costs)
-    apart = (delta[:, None] - delta[None]).abs() * arm >= 0.9 * tp
-    pair = torch.where(apart, pair, torch.full_like(pair, 9.0))
+    far = (delta[:, None] - delta[None]).abs() * arm >= apart * tp
+    pair = torch.where(far, pair, torch.full_like(pair, 9.0))
     a, b = divmod(int(pair.argmin()), steps)
     best = int(single.argmin())
     evidence = []

@@ -68,6 +68,11 @@ def discover(
         for value, chosen in solutions[: config.candidates]:
             if value > 0 and chosen:
                 explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, limit, fixed, still))
+        if explanations and len(explanations[0].motions) < limit:
+            explanations += divided(problem, graphs, min(explanations, key=lambda e: e.score), still)
+        for e in explanations:  # what the search says of the motions as they are now
+            e.value = search.pool.total(search.pool.add(e.motions).tolist())
+            e.score -= config.search_weight * e.value
         lap("labels", 0.95)
     if not explanations:
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]
@@ -111,6 +116,19 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
         motions = motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
         motions, labelling = settle_parts(problem, graphs, motions, axes, rounds=1)
     return prune(problem, graphs, motions, labelling, value, axes)
+
+
+def divided(problem: Problem, graphs: list[Graph], e: Explanation, axes: Tensor) -> list[Explanation]:
+    """The explanation with its slide that best bears it parted into two of nearly the same travel: geometry may not tell, images may."""
+    tried = [(split_amounts(problem, e.labelling, graphs, e.motions, k, apart=0.7), k) for k in range(len(e.motions)) if not e.motions.turn[k]]
+    tried = [(t, k) for t, k in tried if t[0] > 0]
+    if not tried:
+        return []
+    (_, a, b), k = max(tried)
+    motions, labelling = settle_parts(problem, graphs, with_amounts(e.motions, k, a, b), axes)
+    if min(masses(problem, labelling)) < problem.config.min_mass:
+        return []
+    return [Explanation(motions, labelling, e.value, total_score(problem, motions, labelling))]
 
 
 def prune(problem: Problem, graphs: list[Graph], motions: Motions, labelling: Labelling, value: float, axes: Tensor) -> Explanation:

@@ -1,0 +1,145 @@
+"""Whole discovery on small scenes of boxes: the right parts, types and motions, and none where nothing moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from boxes import both, box, door, drawer, shell, PLAIN
+
+from p2gs.models.discovery import DiscoveryConfig, StateEvidence, discover
+from p2gs.types import UserError
+
+SMALL = DiscoveryConfig(surfels=5000, samples=350)
+
+
+def joint_errors(motion, joint, transform):
+    """(axis degrees, axis position, motion in degrees or length) of a found motion of the right type."""
+    T, G = motion.transform.numpy(), transform
+    axis = np.degrees(np.arccos(min(1.0, abs(float(motion.axis.numpy() @ joint.axis)))))
+    if joint.type == "prismatic":
+        return axis, 0.0, float(np.linalg.norm(T[:3, 3] - G[:3, 3]))
+    off = motion.origin.numpy() - joint.origin
+    cross = np.cross(motion.axis.numpy(), joint.axis)
+    n = np.linalg.norm(cross)
+    position = np.linalg.norm(np.cross(off, joint.axis)) if n < 1e-3 else abs(off @ cross) / n
+    turn = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3].T @ G[:3, :3]) - 1) / 2, -1, 1)))
+    return axis, position, turn
+
+
+def match(found, obj):
+    """Index of the found motion of each moving part; fails where one is missing."""
+    order = []
+    for part in obj.parts[1:]:
+        G = part.pose(1.0) @ np.linalg.inv(part.pose(0.0))
+        right = [
+            k
+            for k, m in enumerate(found.motions)
+            if m.type == part.joint.type and np.abs(m.transform.numpy() - G).max() < (0.15 if m.type == "revolute" else 0.05)
+        ]
+        assert right, f"{part.joint.type} {part.joint.motion:.2f} is missing among {[(m.type, round(m.amount, 2)) for m in found.motions]}"
+        axis, position, amount = joint_errors(found.motions[right[0]], part.joint, G)
+        assert axis < 2 and position < 0.03, (axis, position)
+        assert amount < (3 if part.joint.type == "revolute" else 0.03)
+        order.append(right[0])
+    return order
+
+
+def label_accuracy(found, order, truth):
+    part_of = torch.zeros(len(found.motions) + 1, dtype=torch.long)
+    for part, k in enumerate(order):
+        part_of[k + 1] = part + 1
+    return [float((part_of[lab] == t).float().mean()) for lab, t in zip((found.labels_start, found.labels_end), truth, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def door_and_drawer():
+    obj = shell(door(-0.6, 0.6, 0.0, 0.6, True, 60), drawer(-0.6, 0.6, -0.6, 0.0, 0.35), static=[box((-0.7, -0.6, -0.02), (0, 0.6, 0.02), PLAIN)])
+    views, truth = both(obj)
+    return obj, views, truth, discover(*views, "auto", SMALL, seed=0)
+
+
+def test_door_and_drawer(door_and_drawer):
+    obj, _, truth, found = door_and_drawer
+    assert len(found.motions) == 2
+    assert min(label_accuracy(found, match(found, obj), truth)) > 0.9
+    assert all(0 < m.confidence <= 1 for m in found.motions) and sum(m.mass for m in found.motions) > 0.8
+
+
+def test_label_points_agrees_with_labels_and_is_unsure_far_away(door_and_drawer):
+    _, views, _, found = door_and_drawer
+    for state, (view, labels) in enumerate(zip(views, (found.labels_start, found.labels_end), strict=True)):
+        again, margin = found.label_points(view.points, view.colours, state)
+        assert torch.equal(again, labels)
+        assert 0 <= float(margin.min()) and float(margin.max()) <= 1
+    surfels = found.surfels[1]
+    own, _ = found.label_points(surfels.points, surfels.colours, 1)
+    assert float((own == found.probability[1].argmax(1)).float().mean()) > 0.98
+    _, lost = found.label_points(torch.tensor([[5.0, 5.0, 5.0]]), None, 1)
+    assert float(lost) < 1e-3
+
+
+def test_result_is_the_same_twice(door_and_drawer):
+    _, views, _, found = door_and_drawer
+    again = discover(*views, "auto", SMALL, seed=0)
+    assert [m.transform.tolist() for m in again.motions] == [m.transform.tolist() for m in found.motions]
+    assert torch.equal(again.labels_end, found.labels_end)
+
+
+def test_every_candidate_is_complete(door_and_drawer):
+    _, views, _, found = door_and_drawer
+    assert found.candidates and found.candidates[0].motions == found.motions
+    scores = [c.score for c in found.candidates]
+    assert scores == sorted(scores)
+    for c in found.candidates:
+        assert int(c.labels_start.max()) <= len(c.motions) and len(c.labels_end) == len(views[1].points)
+    assert {"tau", "noise", "states", "search", "seconds", "candidates"} <= set(found.diagnostics)
+
+
+def test_double_doors_are_not_swapped():
+    obj = shell(door(-0.6, -0.005, -0.6, 0.6, True, 65), door(0.005, 0.6, -0.6, 0.6, False, 65))
+    views, truth = both(obj, seed=1)
+    found = discover(*views, 3, SMALL, seed=0)
+    assert len(found.motions) == 2
+    assert min(label_accuracy(found, match(found, obj), truth)) > 0.9
+
+
+def test_two_drawers_of_different_travel():
+    divider = [box((-0.7, -0.6, -0.02), (0, 0.6, 0.02), PLAIN)]
+    obj = shell(drawer(-0.6, 0.6, 0.0, 0.6, 0.45), drawer(-0.6, 0.6, -0.6, 0.0, 0.3), static=divider)
+    views, _ = both(obj, seed=2)
+    found = discover(*views, "auto", SMALL, seed=0)
+    assert len(found.motions) == 2
+    match(found, obj)
+
+
+def test_nothing_moves():
+    obj = shell(static=[box((0, -0.6, -0.6), (0.04, 0.6, 0.0), PLAIN)])
+    (start, _), _ = both(obj, seed=3)
+    (end, _), _ = both(obj, seed=4)
+    found = discover(start, end, "auto", SMALL, seed=0)
+    assert found.motions == [] and int(found.labels_start.max()) == 0 and len(found.labels_end) == len(end.points)
+    none = discover(start, end, 1, SMALL, seed=0)
+    assert none.motions == []
+
+
+def test_revealed_inside_is_not_a_part(door_and_drawer):
+    """What the opened door shows of the cupboard's inside stays static, and is unknown rather than moved to the evidence."""
+    _, views, truth, found = door_and_drawer
+    inside = (truth[1] == 0) & (views[1].points[:, 0] < -0.3) & (found.evidence_end != 0)
+    assert int(inside.sum()) > 20
+    assert float((found.evidence_end[inside] == -1).float().mean()) > 0.9
+    assert float((found.labels_end[inside] == 0).float().mean()) > 0.9
+
+
+@pytest.mark.parametrize("bad", [0, -2, 2.5, "three"])
+def test_bad_number_of_parts_is_a_users_mistake(bad, door_and_drawer):
+    with pytest.raises(UserError, match="num_parts"):
+        discover(*door_and_drawer[1], bad, SMALL)
+
+
+def test_views_of_different_size_are_refused(door_and_drawer):
+    start, end = door_and_drawer[1]
+    broken = StateEvidence(start.points, start.colours, None, start.weights, [start.depths[0][:50], *start.depths[1:]], start.alphas, start.cameras)
+    with pytest.raises(ValueError, match="one size"):
+        discover(broken, end, 2, SMALL)

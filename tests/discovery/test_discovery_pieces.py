@@ -1,0 +1,130 @@
+"""The parts of discovery against slow readable twins."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from boxes import both, door, drawer, shell
+
+from p2gs.models.discovery.config import DiscoveryConfig
+from p2gs.models.discovery.evidence import DepthStack, classify
+from p2gs.models.discovery.problem import build_problem
+from p2gs.models.discovery.refine import pattern_search
+from p2gs.models.discovery.rigid import Motions
+from p2gs.models.discovery.surfels import window_planes
+
+
+def counts_naive(stack: DepthStack, points, tau):
+    """One point, one view at a time."""
+    out = np.zeros((3, len(points)))
+    for n, p in enumerate(points.double()):
+        for v, camera in enumerate(stack.cameras):
+            x, y, z = (camera.viewmat[:3, :3].double() @ p + camera.viewmat[:3, 3].double()).tolist()
+            if z <= 0:
+                continue
+            u, w = camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]
+            col, row = math.floor(u), math.floor(w)
+            if not (0 <= col < camera.width and 0 <= row < camera.height):
+                continue
+            seen = []
+            for i in range(max(row - 1, 0), min(row + 2, camera.height)):
+                for j in range(max(col - 1, 0), min(col + 2, camera.width)):
+                    seen.append(float(stack.depth[v, i, j]) if stack.valid[v, i, j] else math.inf)
+            kind = 0 if z < min(seen) - tau else 2 if z > max(seen) + tau else 1
+            out[kind, n] += 1
+    return torch.from_numpy(out).float()
+
+
+def test_free_on_behind_counts_match_the_slow_twin():
+    (start, end), _ = both(shell(door(-0.6, 0.6, -0.6, 0.6, True, 50)), views=6, size=60, points=800)
+    stack = DepthStack(end.depths, end.alphas, end.cameras)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.cat([start.points[:150], torch.rand(50, 3, generator=generator) * 4 - 2])
+    fast, slow = torch.stack(stack.counts(points, 0.02)), counts_naive(stack, points, 0.02)
+    assert slow.sum(1).min() > 50
+    assert float((fast != slow).any(0).float().mean()) < 0.02  # float32 against float64 at pixel borders
+
+
+def test_seen_through_is_moved_and_covered_is_unknown():
+    obj = shell(door(-0.6, 0.6, -0.6, 0.6, True, 70))
+    (start, end), (part, _) = both(obj)
+    problem, _ = build_problem(start, end, DiscoveryConfig(surfels=4000), 0)
+    end_points, start_points = problem.surfels[1].points, problem.surfels[0].points
+    inside = (end_points[:, 0] < -0.2) & (end_points[:, 1:].abs().max(1).values < 0.3)  # of the cupboard, shut away at the start
+    assert int(inside.sum()) > 30
+    assert not bool((problem.moved[1] & inside).any())
+    front = start_points[:, 0] > float(start.points[part == 1][:, 0].quantile(0.3))
+    assert float(problem.moved[0][front].float().mean()) > 0.7
+
+
+def test_classify_needs_enough_views_and_a_majority():
+    free, on = torch.tensor([3.0, 2.0, 9.0, 0.0, 5.0]), torch.tensor([1.0, 0.0, 8.0, 4.0, 2.0])
+    moved, static = classify(free, on)
+    assert moved.tolist() == [True, False, False, False, True]
+    assert static.tolist() == [False, False, False, True, False]
+
+
+def random_motions(n=12):
+    g = torch.Generator().manual_seed(3)
+    axis = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
+    return Motions(torch.arange(n) % 2 == 0, axis, torch.randn(n, 3, generator=g), torch.rand(n, generator=g) + 0.2)
+
+
+def test_motion_goes_there_and_back_and_is_its_matrix():
+    m, p = random_motions(), torch.randn(20, 3)
+    there = m.apply(p)
+    torch.testing.assert_close(m.apply(there, inverse=True), p.expand_as(there), atol=1e-5, rtol=0)
+    for i in range(len(m)):
+        T = m.transform(i)
+        torch.testing.assert_close(p.double() @ T[:3, :3].T + T[:3, 3], there[i].double(), atol=1e-5, rtol=0)
+
+
+def test_twist_basis_is_the_derivative_of_displaced():
+    m, p, h = random_motions(), torch.randn(30, 3), 1e-3
+    basis = m.twist_basis()
+    x = m.apply(p)
+    for c in range(5):
+        step = torch.zeros(len(m), 5)
+        step[:, c] = h
+        measured = (m.displaced(step).apply(p) - m.displaced(-step).apply(p)) / (2 * h)
+        omega, v = basis[:, None, :3, c].expand_as(x), basis[:, None, 3:, c]
+        told = torch.linalg.cross(omega, x) + v
+        moves = m.turn if c >= 3 else torch.ones_like(m.turn)
+        scale = torch.where(m.turn | (torch.tensor(c) == 0), torch.ones(len(m)), torch.ones(len(m)))[:, None, None]
+        torch.testing.assert_close((measured * scale)[moves], told[moves], atol=5e-3, rtol=5e-3)
+
+
+def test_displaced_turns_keep_zero_pitch_and_slides_do_not_turn():
+    m = random_motions()
+    d = m.displaced(torch.randn(len(m), 5) * 0.3)
+    R, t = d.matrices()
+    assert float((t * d.axis).sum(1)[d.turn].abs().max()) < 1e-5
+    torch.testing.assert_close(R[~d.turn], torch.eye(3).expand_as(R[~d.turn]))
+
+
+def test_window_planes_recover_a_tilted_plane():
+    (start, _), _ = both(shell(drawer(-0.6, 0.6, -0.6, 0.6, 0.3)), views=4, size=80, noise=0.0, points=500)
+    stack = DepthStack(start.depths, start.alphas, start.cameras)
+    v, y, x = torch.nonzero(stack.valid, as_tuple=True)
+    point, normal, support, cosine = window_planes(stack, v, y, x, reach=0.03)
+    good = (support > 20) & (cosine > 0.3)
+    along = normal[good].abs().max(1).values  # every face of the boxes is axis-aligned
+    assert float((along > 0.99).float().mean()) > 0.8
+    assert bool((((stack.position[v] - point) * normal).sum(1)[good] > 0).all())
+
+
+def test_pattern_search_climbs_to_the_top_of_a_known_gain():
+    goal = random_motions(2)
+    probe = torch.randn(40, 3)
+
+    def gain(m: Motions):
+        target = goal.apply(probe).repeat_interleave(len(m) // 2, 0)
+        return -(m.apply(probe) - target).pow(2).sum(2).mean(1)
+
+    start = goal.displaced(torch.full((2, 5), 0.15))
+    before = gain(start)
+    end, value = pattern_search(gain, start, 0.1, rounds=40, turn_radius=1.0)
+    assert bool((value > before * 0.02).all()) and bool((value <= 0).all())
+    torch.testing.assert_close(gain(end), value)
