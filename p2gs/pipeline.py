@@ -22,6 +22,8 @@ from p2gs.data.views import TrainingViews
 from p2gs.models import handover
 from p2gs.models.articulation import ArticulationPhase
 from p2gs.models.canonical_fusion import CanonicalFusionPhase
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.evidence import gather_evidence
 from p2gs.models.finish import finish
 from p2gs.models.part_motions import find_part_motions
 from p2gs.models.phase import Phase
@@ -180,7 +182,14 @@ class Pipeline:
         )
 
     def fusion(self, states, motions, section) -> Phase:
-        return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, **self.common())
+        stacks = None
+        if motions is not None and len(motions) and section.config.canonical.free_space > 0:
+            found = self.cfg.phases["discovery"].config
+            size = (found.evidence_size, found.min_opacity)
+            train = [self.scene.select(state=s.state, split="train") for s in states]
+            seen = [gather_evidence(s.gaussians, v, *size, self.cfg.rasterizer, self.device) for s, v in zip(states, train)]
+            stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in seen]
+        return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, stacks=stacks, **self.common())
 
     def articulate(self, canonical, states, motions, section) -> Phase:
         extent = float((self.scene.box[1] - self.scene.box[0]).norm())

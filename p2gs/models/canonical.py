@@ -26,6 +26,7 @@ class CanonicalConfig:
     motion-rich state that did not move), "none" or "all". "none" is the ablation without canonical initialisation: the start
     state's Gaussians as they are, at canonical time 0, with no observed pairs.
     min_opacity: fainter Gaussians take no part in D and matching.  trim: fraction of the largest distances left out of D (floaters).
+    free_space: tolerance (internal units) of the test that drops or relabels what the other state's cameras see through; 0 = off.
     """
 
     beta: Literal["global", "uniform", "per_part"] = "global"
@@ -35,6 +36,14 @@ class CanonicalConfig:
     unmatched: Literal["static", "none", "all"] = "static"
     min_opacity: float = 0.5
     trim: float = 0.02
+    free_space: float = 0.03
+
+
+def keep_rows(c: CanonicalGaussians, labels: Tensor, keep: Tensor) -> CanonicalGaussians:
+    """The canonical Gaussians of ``keep`` [N] bool with new ``labels`` [N]; a relabelled one is no observed pair any more."""
+    paired = c.paired & (labels == c.labels)
+    offsets = None if c.offsets is None else c.offsets[keep]
+    return CanonicalGaussians(c.gaussians[keep], c.betas, labels[keep], c.margin[keep], paired[keep], c.mu0[keep], c.mu1[keep], offsets)
 
 
 def motion_richness(a: Tensor, b: Tensor, trim: float = 0.0) -> float:

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs
-from p2gs.models.canonical import CanonicalConfig, carry, fuse, with_static
+from p2gs.models.canonical import CanonicalConfig, carry, fuse, keep_rows, with_static
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.free_space import explain_by_free_space
 from p2gs.models.handover import CanonicalGaussians, PartMotions, StateGaussians
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
@@ -41,10 +43,16 @@ class CanonicalFusionPhase(ImagePhase):
         states: list[StateGaussians],
         motions: PartMotions | None,
         views,
+        stacks: list[DepthStack] | None = None,
         **common,
     ):
         super().__init__(config, losses, views, **common)
         fused = fuse(states[0].gaussians, states[1].gaussians, motions, config.canonical)
+        if stacks is not None and motions is not None and fused.offsets is None and config.canonical.free_space > 0:
+            T, tau = with_static(motions.transforms), config.canonical.free_space
+            means = fused.gaussians.means
+            labels, keep = explain_by_free_space(means, fused.labels, T, fused.canonical_times, stacks, tau)
+            fused = keep_rows(fused, labels, keep)
         transforms = motions.transforms if motions is not None else torch.zeros(0, 4, 4).double()
         carried = {"labels": fused.labels, "margin": fused.margin, "paired": fused.paired, "mu0": fused.mu0, "mu1": fused.mu1}
         if fused.offsets is not None:

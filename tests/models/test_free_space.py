@@ -1,0 +1,35 @@
+"""What the other state sees through is relabelled or dropped."""
+
+import torch
+from tiny import look_at
+
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.free_space import explain_by_free_space
+
+
+def wall_stack(x: float) -> DepthStack:
+    """Depth maps of an endless wall in the plane y = x, seen from the front by five cameras."""
+    depths, alphas, cameras = [], [], []
+    for shift in (-0.6, -0.3, 0.0, 0.3, 0.6):
+        camera = look_at(torch.tensor([shift, 3.0, 0.4]), 64)
+        ys, xs = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+        rays = torch.stack([xs, ys, torch.ones_like(xs)], -1) @ torch.linalg.inv(camera.K).T
+        world = rays @ camera.viewmat[:3, :3]
+        depths.append((x - camera.position[1]) / world[..., 1])
+        alphas.append(torch.ones(64, 64))
+        cameras.append(camera)
+    return DepthStack(depths, alphas, cameras)
+
+
+def test_a_wall_that_slid_back():
+    """The wall stands at y = 0.5 in the start and at y = 0 in the end: part 1 slides by -0.5."""
+    stacks = [wall_stack(0.5), wall_stack(0.0)]
+    T = torch.eye(4).double().repeat(2, 1, 1)
+    T[1, 1, 3] = -0.5
+    times = torch.zeros(2).double()  # canonical = start
+    means = torch.tensor([[0.0, 0.5, 0.0], [0.1, 0.5, 0.1], [0.0, 0.9, 0.0], [0.0, -0.4, 0.0]])
+    labels = torch.tensor([1, 0, 1, 1])
+    found, keep = explain_by_free_space(means, labels, T, times, stacks, 0.05)
+    # on the wall and moving with it; on it but called static; before it in both states; hidden behind it in both
+    assert found.tolist()[:2] == [1, 1] and keep.tolist() == [True, True, False, True]
+    assert found[3] == 1
