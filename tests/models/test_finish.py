@@ -1,0 +1,81 @@
+"""Labels, slots and joints at the end; parts that are one become one."""
+
+import torch
+from tiny import hinge, photographs, slide, textured_panels
+
+from p2gs.data.views import TrainingViews
+from p2gs.models.finish import FinishConfig, clean_labels, constrain, finish, majority, make_joint, name_types, surviving_slots
+from p2gs.models.handover import Articulation, PartMotions, StateGaussians
+from p2gs.models.part_motions import PartMotionsConfig, simplify, without_part
+from p2gs.models.screw_polish import MovedGaussians, PolishConfig
+from p2gs.ops import se3
+from p2gs.types import GaussianTensors, Similarity
+
+
+def two_states(transform):
+    g, labels = textured_panels()
+    means, quats, sh = MovedGaussians(g, labels).moved(transform[None])
+    states = [StateGaussians(0, g), StateGaussians(1, GaussianTensors(means, quats, g.log_scales, g.opacity_logits, sh))]
+    views = {s: TrainingViews(photographs(g, labels, T, s), [64]) for s, T in ((0, torch.eye(4).double()), (1, transform))}
+    return states, labels, views
+
+
+def test_majority_counts_weights():
+    labels = torch.tensor([0, 1, 1])
+    label, share = majority(labels, torch.tensor([[0, 1, 2]]), torch.tensor([[3.0, 1.0, 1.0]]), 2)
+    assert label.item() == 0 and abs(share.item() - 0.6) < 1e-6
+
+
+def test_clean_labels_mends_a_lone_flip():
+    g, labels = textured_panels()
+    flipped = labels.clone()
+    flipped[7] = 1 - flipped[7]
+    assert torch.equal(clean_labels(g, flipped, 2, 8), labels)
+    assert torch.equal(clean_labels(g, flipped, 2, 0), flipped)
+
+
+def test_joints_say_what_their_transform_does():
+    centre = torch.tensor([0.1, 0.2, 0.3]).double()
+    turn, push = make_joint("revolute", hinge(), centre), make_joint("prismatic", slide(), centre)
+    rebuilt = se3.from_screw(turn.axis, turn.origin, turn.motion / 57.29577951308232)
+    assert torch.allclose(rebuilt, hinge(), atol=1e-9)
+    assert torch.allclose(push.axis * push.motion, slide()[:3, 3]) and push.limits == (0.0, push.motion)
+    assert torch.equal(push.origin, centre)
+
+
+def test_free_motions_get_a_type():
+    small = se3.from_screw(torch.tensor([0.0, 0, 1]).double(), torch.zeros(3).double(), 0.02)
+    assert name_types(["free", "free", "prismatic"], torch.stack([small, hinge(), hinge()]), 5.0) == ["prismatic", "revolute", "prismatic"]
+    assert torch.equal(constrain("prismatic", small, torch.zeros(3).double())[:3, :3], torch.eye(3).double())
+
+
+def test_without_part_renumbers():
+    T = torch.stack([torch.eye(4).double() * k for k in (1, 2, 3)])
+    motions = PartMotions(["a", "b", "c"], T, torch.tensor([0.1, 0.2, 0.3]), [torch.tensor([0, 1, 2, 3])] * 2, [torch.ones(4)] * 2)
+    merged = without_part(motions, 1, 3)
+    assert merged.types == ["a", "c"] and merged.labels[0].tolist() == [0, 1, 2, 2] and merged.transforms[1, 0, 0] == 3
+    assert without_part(motions, 0, 0).labels[0].tolist() == [0, 0, 1, 2]
+
+
+def test_one_part_cut_in_two_becomes_one_and_a_true_part_stays():
+    states, labels, views = two_states(hinge())
+    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
+    near = se3.from_screw(torch.tensor([0.0, 0.1, 1]).double(), torch.tensor([0.4, 0.5, 0]).double(), 0.51)
+    motions = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [cut, cut], [torch.ones(len(cut))] * 2)
+    config = PartMotionsConfig(coarse=PolishConfig(levels=[64], level_starts=[0.0]))
+    simple = simplify(states, motions, views, config, backend="auto")
+    assert len(simple) == 1 and torch.equal(simple.labels[0], labels)
+
+
+def test_empty_and_unmoving_slots_vanish_with_a_word():
+    states, labels, views = two_states(slide())
+    idle = torch.eye(4).double()
+    idle[0, 3] = 0.001
+    probs = torch.nn.functional.one_hot(labels, 4).float()
+    probs[:20] = torch.tensor([0.0, 0, 1, 0])  # a slot that does not move; the last slot is empty
+    learned = Articulation(states[0].gaussians, probs, ["prismatic"] * 3, torch.stack([slide(), idle, slide()]), torch.ones(3), 0.0)
+    config = FinishConfig(polish=PolishConfig(steps=0), clean_neighbours=0)
+    assert surviving_slots(learned, learned.part_ids, config) == [1]
+    twin, notes = finish(learned, states, views, config, Similarity(), seed=0, backend="auto")
+    assert len(twin.parts) == 2 and len(notes) == 2 and "slot 2 of 3 vanished" in notes[0]
+    assert twin.parts[1].joint.type == "prismatic" and int(twin.part_ids.max()) == 1
