@@ -55,7 +55,7 @@ def discover(
     lap("evidence", 0.2)
     graphs = [Graph.build(s.points, s.normals, s.colours) for s in problem.surfels]
     explanations: list[Explanation] = []
-    if limit > 0 and max(len(s) for s in problem.samples) >= config.min_moved:
+    if limit > 0 and max(map(len, problem.samples)) >= config.min_moved and min(map(len, problem.samples)) >= 3:
         axes = directions(problem)
         swept = sweep(problem, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in problem.samples])
         still = static_axes(problem)
