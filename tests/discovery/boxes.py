@@ -52,7 +52,7 @@ def shell(*moving, static=()):
     return SyntheticObject("boxes", (SyntheticPart("base", tuple(base)), *moving)).fitted()
 
 
-def evidence(obj: SyntheticObject, state: int, seed: int = 0, size: int = 120, views: int = 32, noise: float = 0.003, points: int = 4000):
+def evidence(obj: SyntheticObject, state: int, seed: int = 0, size: int = 110, views: int = 28, noise: float = 0.003, points: int = 4000):
     """What a reconstruction of this state might give, and the true part of each of its points."""
     rng = np.random.default_rng([seed, state])
     primitives, ids = obj.posed(float(state))

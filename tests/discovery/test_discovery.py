@@ -10,7 +10,7 @@ from boxes import both, box, door, drawer, shell, PLAIN
 from p2gs.models.discovery import DiscoveryConfig, StateEvidence, discover
 from p2gs.types import UserError
 
-SMALL = DiscoveryConfig(surfels=5000, samples=350)
+SMALL = DiscoveryConfig(surfels=4000, samples=250, candidates=2)
 
 
 def joint_errors(motion, joint, transform):
@@ -106,7 +106,7 @@ def test_double_doors_are_not_swapped():
 
 def test_two_drawers_of_different_travel():
     divider = [box((-0.7, -0.6, -0.02), (0, 0.6, 0.02), PLAIN)]
-    obj = shell(drawer(-0.6, 0.6, 0.0, 0.6, 0.45), drawer(-0.6, 0.6, -0.6, 0.0, 0.3), static=divider)
+    obj = shell(drawer(-0.6, 0.6, 0.0, 0.6, 0.3), drawer(-0.6, 0.6, -0.6, 0.0, 0.45), static=divider)
     views, _ = both(obj, seed=2)
     found = discover(*views, "auto", SMALL, seed=0)
     assert len(found.motions) == 2

@@ -56,11 +56,14 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
     m = motions[k : k + 1]
     if max(len(s) for s in samples) < 8:
         return m
-    weights = [torch.full((len(s),), 1.0 / max(1, len(s))) for s in samples]
+    weights = []
+    for s, index in enumerate(samples):  # who is not known to have moved may be a neighbour's, and only seconds the others
+        w = torch.where(problem.moved[s], 0.3 + problem.trust[s], torch.where(problem.static[s], 0.03, 0.2))[index]
+        weights.append(w / w.sum().clamp_min(1e-9))
     tp = problem.scale.tp
 
     def gain(m: Motions) -> Tensor:
-        return sum((1 - problem.cost(m, s, samples[s])[0]).mean(1) for s in (0, 1) if len(samples[s]) >= 8)
+        return sum((1 - problem.cost(m, s, samples[s])[0]) @ weights[s] for s in (0, 1) if len(samples[s]) >= 8)
 
     def sharpen(m: Motions) -> tuple[Motions, Tensor]:
         m, v = pattern_search(gain, m, 0.3 * tp, 10)

@@ -53,7 +53,7 @@ def discover(
 
     problem, figures = build_problem(start, end, config, seed)
     lap("evidence", 0.2)
-    graphs = [Graph.build(s.points, s.normals, s.colours) for s in problem.surfels]
+    graphs = [Graph(s.points, s.normals, s.colours) for s in problem.surfels]
     explanations: list[Explanation] = []
     if limit > 0 and max(map(len, problem.samples)) >= config.min_moved and min(map(len, problem.samples)) >= 3:
         axes = directions(problem)
@@ -72,7 +72,7 @@ def discover(
             explanations += divided(problem, graphs, min(explanations, key=lambda e: e.score), still)
         for e in explanations:  # what the search says of the motions as they are now
             e.value = search.pool.total(search.pool.add(e.motions).tolist())
-            e.score -= config.search_weight * e.value
+            e.score += 0.5 * config.part_cost * len(e.motions) - config.search_weight * e.value
         lap("labels", 0.95)
     if not explanations:
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]

@@ -65,7 +65,7 @@ class Pool:
     pays [B, P0], [B, P1] in 0..1: saturated (a sharper fit of what is explained already is worth nothing here), averaged over a
     point's neighbours that face alike, times the joint's plausibility.  twin [B, P]: the sample of the other state next to where the
     point lands.  back [B, P]: what that sample pays under the same motion.  owned, loose [B, P]: does the point land on a moved surface,
-    on one of unknown fate.
+    on one of unknown fate or none at all.
     """
 
     FULL, NONE = 0.16, 0.30  # landing costs that pay all and nothing
@@ -103,8 +103,8 @@ class Pool:
                 raw.append(fit)
                 hidden.append((cost < 0.45).float())
                 twin.append(self.closest[1 - s][j])
-                self.owned[s] = torch.cat([self.owned[s], self.problem.moved[1 - s][j]])
-                self.loose[s] = torch.cat([self.loose[s], self.problem.loose(1 - s, j)])
+                self.owned[s] = torch.cat([self.owned[s], self.problem.moved[1 - s][j] & (fit > 0)])
+                self.loose[s] = torch.cat([self.loose[s], self.problem.loose(1 - s, j) | (fit <= 0)])
             f = plausibility(self.problem, m, raw, self.samples)[:, None]
             trust = (self.mean(raw) / 0.1).clamp(0, 1)[:, None]
             local = [((raw[s] @ self.smooth[s] - 0.25) / 0.5).clamp(0, 1) for s in (0, 1)]
@@ -211,12 +211,18 @@ class Search:
     def fill(self, rounds: int) -> None:
         """Greedy pursuit: propose, keep the best few, explain away with the best one."""
         chosen: list[int] = []
+        idle, last = 0, 0.0
         for _ in range(rounds):
-            motions, value = self.propose(chosen, 96, 16)
+            motions, _ = self.propose(chosen, 96, 16)
             if len(motions) == 0:
                 break
             index = self.pool.add(motions)
             chosen.append(max(index.tolist(), key=lambda k: self.value([*chosen, k])))
+            total = self.pool.total(chosen)
+            idle = idle + 1 if total - last < 0.5 * self.cost else 0
+            last = max(last, total)
+            if idle == 2:  # what is left over is noise
+                break
 
     def value(self, chosen) -> float:
         """Evidence of a set less the cost of its parts; nearly equal motions cost double."""
