@@ -28,7 +28,7 @@ class PartMotionsConfig:
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
     candidates: how many complete explanations are compared by re-rendering.  coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
-    freedom_penalty: relative image loss by which the freer explanation must win: a turn against a slide, a further part against one less.
+    freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: the same for a further part.
     same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one
     unless the image loss rises by more than this share.
     """
@@ -38,6 +38,7 @@ class PartMotionsConfig:
     candidates: int = 3
     compare_types_below: float = 20.0
     freedom_penalty: float = 0.002
+    part_penalty: float = 0.006
     same_motion: float = 0.04
     merge_penalty: float = 0.012
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
@@ -83,8 +84,9 @@ def find_part_motions(
         motions = simplify(states, motions, views, config, backend=backend, device=device)
         cost = explanation_cost(states, motions, views, level, backend, device)
         costs.append(cost)
-        if best is None or cost < best[0]:
-            best = (cost, motions, number)
+        rank = cost * (1 + config.part_penalty) ** len(motions)
+        if best is None or rank < best[0]:
+            best = (rank, motions, number)
     motions = best[1]
     motions = settle_types(states, motions, views, config, seed=seed, backend=backend, device=device)
     motions.diagnostics = {"explanation": best[2], "photometric_costs": costs, **_plain(found.diagnostics)}
@@ -181,7 +183,7 @@ def simplify(states, motions: PartMotions, views, config: PartMotionsConfig, *, 
                 continue
             tried.add(change)
             lower = explanation_cost(states, reduced, views, config.coarse.levels[-1], backend, device)
-            penalty = config.merge_penalty if change[0] == "merge" else config.freedom_penalty
+            penalty = config.merge_penalty if change[0] == "merge" else config.part_penalty
             if lower <= cost * (1 + penalty):
                 found = (reduced, lower)
                 break
