@@ -18,7 +18,7 @@ from p2gs.models.phase import PHASES
 from p2gs.models.screw_polish import PolishConfig, average_motion, photometric_cost, polish
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
-from p2gs.types import TwoStateScene
+from p2gs.types import TwoStateScene, UserError
 
 
 @dataclass
@@ -72,6 +72,10 @@ def find_part_motions(
         gather_evidence(s.gaussians, scene.select(state=s.state, split="train"), config.evidence_size, config.min_opacity, backend, device)
         for s in states
     ]
+    for s, seen in zip(states, evidence, strict=True):
+        if len(seen.points) < 10 or not any(bool((d > 0).any()) for d in seen.depths):
+            name = ("start", "end")[s.state]
+            raise UserError(f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)")
     say("looking for parts")
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
     explanations = _explanations(found)[: max(config.candidates, 1)]

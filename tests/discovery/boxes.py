@@ -73,7 +73,9 @@ def evidence(obj: SyntheticObject, state: int, seed: int = 0, size: int = 110, v
     cloud, parts = np.concatenate(cloud), np.concatenate(parts)
     pick = rng.choice(len(cloud), points, replace=False)
     cloud = torch.from_numpy(cloud[pick]).float()
-    return StateEvidence(cloud, torch.full((points, 3), 0.5), None, torch.ones(points), depths, alphas, cameras), torch.from_numpy(parts[pick])
+    return StateEvidence(cloud, torch.full((points, 3), 0.5), None, torch.ones(points), depths, alphas, cameras), torch.from_numpy(
+        parts[pick]
+    )
 
 
 def both(obj: SyntheticObject, seed: int = 0, **kw):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from boxes import both, box, door, drawer, shell, PLAIN
+from boxes import PLAIN, both, box, door, drawer, shell
 
 from p2gs.models.discovery import DiscoveryConfig, StateEvidence, discover
 from p2gs.types import UserError
@@ -54,7 +54,9 @@ def label_accuracy(found, order, truth):
 
 @pytest.fixture(scope="module")
 def door_and_drawer():
-    obj = shell(door(-0.6, 0.6, 0.0, 0.6, True, 60), drawer(-0.6, 0.6, -0.6, 0.0, 0.35), static=[box((-0.7, -0.6, -0.02), (0, 0.6, 0.02), PLAIN)])
+    obj = shell(
+        door(-0.6, 0.6, 0.0, 0.6, True, 60), drawer(-0.6, 0.6, -0.6, 0.0, 0.35), static=[box((-0.7, -0.6, -0.02), (0, 0.6, 0.02), PLAIN)]
+    )
     views, truth = both(obj)
     return obj, views, truth, discover(*views, "auto", SMALL, seed=0)
 
@@ -140,6 +142,8 @@ def test_bad_number_of_parts_is_a_users_mistake(bad, door_and_drawer):
 
 def test_views_of_different_size_are_refused(door_and_drawer):
     start, end = door_and_drawer[1]
-    broken = StateEvidence(start.points, start.colours, None, start.weights, [start.depths[0][:50], *start.depths[1:]], start.alphas, start.cameras)
+    broken = StateEvidence(
+        start.points, start.colours, None, start.weights, [start.depths[0][:50], *start.depths[1:]], start.alphas, start.cameras
+    )
     with pytest.raises(ValueError, match="one size"):
         discover(broken, end, 2, SMALL)

@@ -111,10 +111,14 @@ def test_everything_that_can_be_null(folder, tmp_path):
         f"--phases.articulation.losses.{n}=null"
         for n in ("alpha", "depth_variance", "depth", "part", "art", "contact", "velocity", "vector")
     ]
-    words += ["--phases.single_state.steps=20"]
     done = fit(folder, "--run", str(tmp_path / "bare"), *words)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "bare" / "twin.json").exists()
+
+
+def test_an_empty_reconstruction_is_told(folder, tmp_path):
+    done = fit(folder, "--run", str(tmp_path / "empty"), "--phases.single_state.steps=2")
+    assert done.returncode == 2 and "nothing opaque" in done.stderr and "Traceback" not in done.stderr, done.stderr
 
 
 def test_only_needs_what_comes_before(folder, tmp_path):

@@ -59,7 +59,7 @@ class Landing:
         self.nearest = self._nearest()
 
     def _centres(self, size: Tensor, h: float) -> Tensor:
-        axes = [torch.arange(int(s)) * h + float(o) + h / 2 for s, o in zip(size, self.lo)]
+        axes = [torch.arange(int(s)) * h + float(o) + h / 2 for s, o in zip(size, self.lo, strict=False)]
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
     def _nearest(self) -> Tensor:

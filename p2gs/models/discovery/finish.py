@@ -72,7 +72,11 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
         return (fine, w) if float(w) > float(v) - 0.01 else (m, v)
 
     free, value = sharpen(m)
-    middle = problem.surfels[0].points[samples[0]].mean(0) if len(samples[0]) else free.apply(problem.surfels[1].points[samples[1]], True)[0].mean(0)
+    middle = (
+        problem.surfels[0].points[samples[0]].mean(0)
+        if len(samples[0])
+        else free.apply(problem.surfels[1].points[samples[1]], True)[0].mean(0)
+    )
     on_axis = snapped(problem, free, middle, axes)
     if len(on_axis):
         on_axis, v = pattern_search(gain, on_axis, 0.5 * tp, 10, tilt=False)
@@ -82,7 +86,9 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
     return free
 
 
-def split_amounts(problem: Problem, labelling: Labelling, graphs: list[Graph], motions: Motions, k: int, apart: float = 0.9, steps: int = 25):
+def split_amounts(
+    problem: Problem, labelling: Labelling, graphs: list[Graph], motions: Motions, k: int, apart: float = 0.9, steps: int = 25
+):
     """Do two amounts about one axis explain part k better than one?  (evidence, amount a, amount b).
 
     Costs of every moved point over amounts within four tolerances, averaged over neighbours. Of the best pair, the evidence is what

@@ -16,10 +16,11 @@ from p2gs.models.discovery.evidence import StateEvidence
 from p2gs.models.discovery.finish import Explanation, settle_parts, split_amounts, with_amounts
 from p2gs.models.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.models.discovery.labels import Graph, Labelling, label
+from p2gs.models.discovery.pool import plausibility
 from p2gs.models.discovery.problem import Problem, build_problem
 from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
 from p2gs.models.discovery.rigid import Motions
-from p2gs.models.discovery.search import Search, plausibility
+from p2gs.models.discovery.search import Search
 from p2gs.models.discovery.verify import image_score, violation
 from p2gs.types import UserError
 
@@ -72,7 +73,7 @@ def discover(
             explanations += divided(problem, graphs, min(explanations, key=lambda e: e.score), still)
         for e in explanations:  # what the search says of the motions as they are now
             e.value = search.pool.total(search.pool.add(e.motions).tolist())
-            e.score += 0.5 * config.part_cost * len(e.motions) - config.search_weight * e.value
+            e.score += (0.0 if fixed else 0.2 * config.part_cost) * len(e.motions) - config.search_weight * e.value
         lap("labels", 0.95)
     if not explanations:
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]
@@ -88,7 +89,11 @@ def discover(
     out.margin_end = best.label_points(end.points, end.colours, 1)[1]
     out.evidence_start, out.evidence_end = (nearest_evidence(problem, e.points, s) for s, e in enumerate((start, end)))
     out.diagnostics["candidates"] = [
-        {"score": round(c.score, 4), "value": round(c.value, 4), "parts": [(m.type, round(m.amount, 4), round(m.confidence, 3)) for m in c.motions]}
+        {
+            "score": round(c.score, 4),
+            "value": round(c.value, 4),
+            "parts": [(m.type, round(m.amount, 4), round(m.confidence, 3)) for m in c.motions],
+        }
         for c in candidates
     ]
     lap("description", 1.0)
@@ -120,7 +125,9 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
 
 def divided(problem: Problem, graphs: list[Graph], e: Explanation, axes: Tensor) -> list[Explanation]:
     """The explanation with its slide that best bears it parted into two of nearly the same travel: geometry may not tell, images may."""
-    tried = [(split_amounts(problem, e.labelling, graphs, e.motions, k, apart=0.7), k) for k in range(len(e.motions)) if not e.motions.turn[k]]
+    tried = [
+        (split_amounts(problem, e.labelling, graphs, e.motions, k, apart=0.7), k) for k in range(len(e.motions)) if not e.motions.turn[k]
+    ]
     tried = [(t, k) for t, k in tried if t[0] > 0]
     if not tried:
         return []

@@ -136,9 +136,11 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
     """Surfels, masks and look-ups of both states, and each stage's figures."""
     stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in (start, end)]
     points = torch.cat([e.points for e in (start, end)])
-    box = torch.quantile(points[torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))[:100000]], torch.tensor([0.005, 0.995]), 0)
+    box = torch.quantile(
+        points[torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))[:100000]], torch.tensor([0.005, 0.995]), 0
+    )
     diag = float((box[1] - box[0]).norm())
-    built = [build_surfels(e, st, diag, config.surfels, config.noise_floor) for e, st in zip((start, end), stacks)]
+    built = [build_surfels(e, st, diag, config.surfels, config.noise_floor) for e, st in zip((start, end), stacks, strict=False)]
     surfels = [b[0] for b in built]
     noise, spacing = max(s.noise for s in surfels), max(s.spacing for s in surfels)
     tau = 3 * noise + 0.2 * spacing
@@ -161,7 +163,8 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
         "noise": noise,
         "tau": scale.tau,
         "states": [
-            b[1] | {"moved": int(m.sum()), "static": int(t.sum()), "unknown": int((~m & ~t).sum())} for b, m, t in zip(built, moved, static)
+            b[1] | {"moved": int(m.sum()), "static": int(t.sum()), "unknown": int((~m & ~t).sum())}
+            for b, m, t in zip(built, moved, static, strict=False)
         ],
     }
     return problem, figures

@@ -39,7 +39,9 @@ def normal_equations(problem: Problem, motions: Motions, samples: list[Tensor], 
     return A, b
 
 
-def gauss_newton(problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], rounds: int = 8, width0=None, width1=None) -> Motions:
+def gauss_newton(
+    problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], rounds: int = 8, width0=None, width1=None
+) -> Motions:
     """A few damped steps with a kernel shrinking from ``width0`` (1.5 coarse voxels) to ``width1`` (the surface tolerance)."""
     hc, tp = problem.landings[0].hc, problem.scale.tp
     width0, width1 = width0 or 1.5 * hc, width1 or tp
