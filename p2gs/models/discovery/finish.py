@@ -77,7 +77,7 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
         if len(samples[0])
         else free.apply(problem.surfels[1].points[samples[1]], True)[0].mean(0)
     )
-    on_axis = snapped(problem, free, middle, axes)
+    on_axis = snapped(problem, free, middle, axes, 15.0 if bool(free.turn) else 22.0)
     if len(on_axis):
         on_axis, v = pattern_search(gain, on_axis, 0.5 * tp, 10, tilt=False)
         best = int(v.argmax())
