@@ -16,12 +16,16 @@ from p2gs.models.discovery.rigid import Motions
 
 @dataclass
 class Explanation:
-    """A complete explanation: motions, labelling, value of the set and image-space score (lower is better)."""
+    """A complete explanation: motions, labelling, value of the set and image-space score (lower is better).
+
+    only_images: differs from the best by less than the geometry can tell.
+    """
 
     motions: Motions
     labelling: Labelling
     value: float
     score: float = 0.0
+    only_images: bool = False
 
 
 def part_samples(problem: Problem, labelling: Labelling, k: int, n: int, moved_only: bool = True) -> list[Tensor]:

@@ -79,6 +79,9 @@ def discover(
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]
         explanations = [Explanation(Motions.empty(), Labelling(nothing, nothing), 0.0)]
     explanations.sort(key=lambda e: e.score)
+    for e in [e for e in explanations[2:] if e.only_images]:
+        explanations.remove(e)
+        explanations.insert(1, e)
     candidates = [describe(problem, e, start, end) for e in explanations]
     best = candidates[0]
     out = Discovery(
@@ -135,7 +138,7 @@ def divided(problem: Problem, graphs: list[Graph], e: Explanation, axes: Tensor)
     motions, labelling = settle_parts(problem, graphs, with_amounts(e.motions, k, a, b), axes)
     if min(masses(problem, labelling)) < problem.config.min_mass:
         return []
-    return [Explanation(motions, labelling, e.value, total_score(problem, motions, labelling))]
+    return [Explanation(motions, labelling, e.value, total_score(problem, motions, labelling), only_images=True)]
 
 
 def prune(problem: Problem, graphs: list[Graph], motions: Motions, labelling: Labelling, value: float, axes: Tensor) -> Explanation:
