@@ -140,10 +140,9 @@ def test_bad_number_of_parts_is_a_users_mistake(bad, door_and_drawer):
         discover(*door_and_drawer[1], bad, SMALL)
 
 
-def test_views_of_different_size_are_refused(door_and_drawer):
+def test_map_of_another_size_than_its_camera_is_refused(door_and_drawer):
     start, end = door_and_drawer[1]
-    broken = StateEvidence(
-        start.points, start.colours, None, start.weights, [start.depths[0][:50], *start.depths[1:]], start.alphas, start.cameras
-    )
-    with pytest.raises(ValueError, match="one size"):
+    short = [start.depths[0][:50], *start.depths[1:]]
+    broken = StateEvidence(start.points, start.colours, None, start.weights, short, start.alphas, start.cameras)
+    with pytest.raises(ValueError, match="camera's size"):
         discover(broken, end, 2, SMALL)

@@ -47,6 +47,30 @@ def test_free_on_behind_counts_match_the_slow_twin():
     assert float((fast != slow).any(0).float().mean()) < 0.02  # float32 against float64 at pixel borders
 
 
+def test_views_of_different_size_are_counted_alike():
+    """A view cropped to its upper left says of points inside the crop what the whole view says, and nothing of the others."""
+    (start, end), _ = both(shell(door(-0.6, 0.6, -0.6, 0.6, True, 50)), views=4, size=60, points=600)
+    keep = [(40, 60), (60, 45), (60, 60), (50, 50)]
+    cameras = [c.cropped(0, 0, w, h) for c, (h, w) in zip(end.cameras, keep, strict=True)]
+    crop = DepthStack(
+        [d[:h, :w] for d, (h, w) in zip(end.depths, keep, strict=True)],
+        [a[:h, :w] for a, (h, w) in zip(end.alphas, keep, strict=True)],
+        cameras,
+    )
+    whole = DepthStack(end.depths, end.alphas, end.cameras)
+    views = torch.arange(4)
+    _, _, inside = crop.project(start.points, views)
+    assert 0 < int((~inside).sum()) < inside.numel()
+    for v in range(4):
+        one = torch.tensor([v])
+        a, b = torch.stack(crop.counts(start.points, 0.02, one)), torch.stack(whole.counts(start.points, 0.02, one))
+        h, w = keep[v]
+        x, y = (whole.project(start.points, one)[1][:, 0] % 60), (whole.project(start.points, one)[1][:, 0] // 60 % 60)
+        deep = inside[:, v] & (x < w - 1) & (y < h - 1)
+        assert torch.equal(a[:, deep], b[:, deep])
+        assert float(a[:, ~inside[:, v]].sum()) == 0
+
+
 def test_seen_through_is_moved_and_covered_is_unknown():
     obj = shell(door(-0.6, 0.6, -0.6, 0.6, True, 70))
     (start, end), (part, _) = both(obj)

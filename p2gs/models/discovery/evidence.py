@@ -35,15 +35,24 @@ class StateEvidence:
 class DepthStack:
     """The depth maps of one state as intervals: near/far [V, H, W] are 3x3 minimum and maximum; background is infinitely far.
 
-    The interval makes a depth edge count as surface, never as free space. Raises ValueError when views differ in size.
+    The interval makes a depth edge count as surface, never as free space. Views of different size are padded to the largest.
+    Raises ValueError where a map and its camera differ in size.
     """
 
     def __init__(self, depths: Sequence[Tensor], alphas: Sequence[Tensor], cameras: Sequence[Camera]):
-        sizes = {(c.height, c.width) for c in cameras} | {tuple(d.shape) for d in depths} | {tuple(a.shape) for a in alphas}
-        if len(sizes) != 1 or not len(depths) == len(alphas) == len(cameras):
-            raise ValueError(f"every view needs a camera, a depth and an alpha map of one size, got sizes {sorted(sizes)}")
-        self.depth = torch.stack([d.float() for d in depths])
-        self.valid = (torch.stack([a.float() for a in alphas]) > 0.5) & (self.depth > 0)
+        shapes = [(c.height, c.width) for c in cameras]
+        if not len(depths) == len(alphas) == len(cameras) or any(
+            tuple(d.shape) != size or tuple(a.shape) != size for d, a, size in zip(depths, alphas, shapes, strict=True)
+        ):
+            raise ValueError("every view needs a depth and an alpha map of its camera's size")
+        H, W = max(h for h, _ in shapes), max(w for _, w in shapes)
+
+        def stack(maps: Sequence[Tensor]) -> Tensor:
+            return torch.stack([torch.nn.functional.pad(m.float(), (0, W - m.shape[1], 0, H - m.shape[0])) for m in maps])
+
+        self.size = torch.tensor(shapes)  # [V, 2] height, width
+        self.depth = stack(depths)
+        self.valid = (stack(alphas) > 0.5) & (self.depth > 0)
         self.cameras = list(cameras)
         self.viewmat = torch.stack([c.viewmat for c in cameras]).float()
         self.K = torch.stack([c.K for c in cameras]).float()
@@ -74,7 +83,8 @@ class DepthStack:
         u = cam[..., 0] / z.clamp_min(1e-6) * K[:, 0, 0] + K[:, 0, 2]
         v = cam[..., 1] / z.clamp_min(1e-6) * K[:, 1, 1] + K[:, 1, 2]
         H, W = self.depth.shape[1:]
-        inside = (z > 1e-6) & (u >= 0) & (u < W) & (v >= 0) & (v < H)
+        height, width = self.size[views].unbind(1)
+        inside = (z > 1e-6) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         index = v.clamp(0, H - 1).long() * W + u.clamp(0, W - 1).long()
         return z, index + views * (H * W), inside
 
