@@ -10,6 +10,9 @@ from boxes import both, door, drawer, shell
 
 from p2gs.models.discovery.config import DiscoveryConfig
 from p2gs.models.discovery.evidence import DepthStack, classify
+from p2gs.models.discovery.finish import Explanation
+from p2gs.models.discovery.labels import Labelling
+from p2gs.models.discovery.pipeline import ranked
 from p2gs.models.discovery.problem import build_problem
 from p2gs.models.discovery.refine import pattern_search
 from p2gs.models.discovery.rigid import Motions
@@ -81,6 +84,13 @@ def test_seen_through_is_moved_and_covered_is_unknown():
     assert not bool((problem.moved[1] & inside).any())
     front = start_points[:, 0] > float(start.points[part == 1][:, 0].quantile(0.3))
     assert float(problem.moved[0][front].float().mean()) > 0.7
+
+
+def test_ranking_is_by_score_but_what_only_images_tell_comes_second():
+    make = lambda score, n, only=False: Explanation(random_motions(n), Labelling([], []), 0.0, score, only)  # noqa: E731
+    order = ranked([make(0.3, 2), make(0.1, 3), make(0.5, 4, True), make(0.2, 2)])
+    assert [(e.score, e.only_images) for e in order] == [(0.1, False), (0.5, True), (0.2, False), (0.3, False)]
+    assert ranked([make(0.3, 2), make(0.1, 2, True)])[0].score == 0.1
 
 
 def test_classify_needs_enough_views_and_a_majority():

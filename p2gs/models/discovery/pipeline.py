@@ -78,11 +78,7 @@ def discover(
     if not explanations:
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]
         explanations = [Explanation(Motions.empty(), Labelling(nothing, nothing), 0.0)]
-    explanations.sort(key=lambda e: e.score)
-    for e in [e for e in explanations[2:] if e.only_images]:
-        explanations.remove(e)
-        explanations.insert(1, e)
-    candidates = [describe(problem, e, start, end) for e in explanations]
+    candidates = [describe(problem, e, start, end) for e in ranked(explanations)]
     best = candidates[0]
     out = Discovery(
         motions=best.motions, surfels=best.surfels, probability=best.probability, score=best.score, value=best.value,
@@ -124,6 +120,12 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
         motions = motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
         motions, labelling = settle_parts(problem, graphs, motions, axes, rounds=1)
     return prune(problem, graphs, motions, labelling, value, axes)
+
+
+def ranked(explanations: list[Explanation]) -> list[Explanation]:
+    """Best first; one that only images can tell from the best goes second."""
+    first, *rest = sorted(explanations, key=lambda e: e.score)
+    return [first, *sorted(rest, key=lambda e: not e.only_images)]
 
 
 def divided(problem: Problem, graphs: list[Graph], e: Explanation, axes: Tensor) -> list[Explanation]:
