@@ -139,7 +139,7 @@ class ArticulationPhase(ImagePhase):
         camera, target = self.target(step // 2, state)
         g = self.splats.tensors()
         probs = self.head(self.splats.psi, self.temperature(step))
-        render = self.render(blend_move(g, probs, self.screws.at(state - self.times)), camera, target.background)
+        render = self.render(blend_move(g, probs, self.screws.twists(state - self.times)), camera, target.background)
         self.refresh(step, g, probs)
         due = any(loss.active(step, self.total_steps) for name, loss in self.losses.items() if name not in IMAGE_LOSSES)
         return LossInputs(step, self.total_steps, g, render, target, camera, self.part_state(g, probs) if due else None, self.loss_cache)

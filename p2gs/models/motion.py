@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from p2gs.models.canonical import with_static
-from p2gs.ops import se3, so3
+from p2gs.ops import blend, se3, so3
 from p2gs.types import GaussianTensors
 
 
@@ -23,7 +23,11 @@ class PartScrews(nn.Module):
 
     def at(self, span: Tensor) -> Tensor:
         """Motions exp(span_k xi_k) of slots 0..K-1, [K, 4, 4]; span [K] (state time minus canonical time)."""
-        return with_static(se3.exp(self.xi * span[1:, None].to(self.xi)))
+        return with_static(se3.exp(self.twists(span)))
+
+    def twists(self, span: Tensor) -> Tensor:
+        """span_k xi_k of the movable parts, [K-1, 6]; span [K] as in ``at``."""
+        return self.xi * span[1:, None].to(self.xi)
 
 
 def initial_screws(kind: str, parts: int, generator: torch.Generator) -> Tensor:
@@ -37,12 +41,7 @@ def initial_screws(kind: str, parts: int, generator: torch.Generator) -> Tensor:
     return T
 
 
-def blend_move(g: GaussianTensors, probs: Tensor, transforms: Tensor) -> GaussianTensors:
-    """mu' = sum_k p_k (R_k mu + t_k); rotations by the p-weighted, sign-aligned quaternions. probs [N, K], transforms [K, 4, 4]."""
-    n, k = probs.shape
-    rows = (probs @ transforms[:, :3].reshape(k, 12)).reshape(n, 3, 4)
-    means = (rows[:, :, :3] * g.means[:, None, :]).sum(-1) + rows[:, :, 3]  # faster than a batched product of 3x3
-    turns = so3.matrix_to_quat(transforms[:, :3, :3])
-    turns = torch.where((turns * turns[:1]).sum(1, keepdim=True) < 0, -turns, turns)
-    quats = so3.quat_multiply(so3.quat_normalize(probs @ turns), so3.quat_normalize(g.quats))
+def blend_move(g: GaussianTensors, probs: Tensor, twists: Tensor) -> GaussianTensors:
+    """The Gaussians where their soft assignment probs [N, K] puts them under the motions of twists [K-1, 6]; see ``ops.blend``."""
+    means, quats = blend.blend_move(g.means, g.quats, probs, twists)
     return GaussianTensors(means, quats, g.log_scales, g.opacity_logits, g.sh)

@@ -8,6 +8,7 @@
 #include <cstdint>
 
 #include "adam.h"
+#include "blend.h"
 #include "knn.h"
 #include "raster.h"
 #include "ssim.h"
@@ -17,6 +18,7 @@ namespace p2gs {
 struct Kernels {
     const char* isa;
     AdamKernels adam;
+    BlendKernels blend;
     SsimKernels ssim;
     RasterKernels raster;
     KnnKernels knn;
