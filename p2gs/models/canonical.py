@@ -43,7 +43,9 @@ def keep_rows(c: CanonicalGaussians, labels: Tensor, keep: Tensor) -> CanonicalG
     """The canonical Gaussians of ``keep`` [N] bool with new ``labels`` [N]; a relabelled one is no observed pair any more."""
     paired = c.paired & (labels == c.labels)
     offsets = None if c.offsets is None else c.offsets[keep]
-    return CanonicalGaussians(c.gaussians[keep], c.betas, labels[keep], c.margin[keep], paired[keep], c.mu0[keep], c.mu1[keep], offsets)
+    counted = {**c.diagnostics, "relabelled": int((keep & (labels != c.labels)).sum()), "dropped": int((~keep).sum())}
+    kept = (labels[keep], c.margin[keep], paired[keep], c.mu0[keep], c.mu1[keep])
+    return CanonicalGaussians(c.gaussians[keep], c.betas, *kept, offsets, counted)
 
 
 def motion_richness(a: Tensor, b: Tensor, trim: float = 0.0) -> float:

@@ -58,6 +58,7 @@ class CanonicalFusionPhase(ImagePhase):
         if fused.offsets is not None:
             carried["offsets"] = fused.offsets
         self.splats = Splats(fused.gaussians, carried=carried)
+        self.counted = fused.diagnostics
         self.register_buffer("betas", fused.betas)
         self.register_buffer("transforms", transforms)
 
@@ -87,7 +88,7 @@ class CanonicalFusionPhase(ImagePhase):
     def hand_over(self) -> CanonicalGaussians:
         s = self.splats
         offsets = s.offsets if hasattr(s, "offsets") else None
-        return CanonicalGaussians(s.tensors().clone(), self.betas, s.labels, s.margin, s.paired, s.mu0, s.mu1, offsets)
+        return CanonicalGaussians(s.tensors().clone(), self.betas, s.labels, s.margin, s.paired, s.mu0, s.mu1, offsets, self.counted)
 
     @torch.no_grad()
     def preview(self, times: list[float]) -> dict[str, Tensor]:

@@ -49,6 +49,7 @@ class CanonicalGaussians:
     betas [K] float64: one per part, all equal unless ``beta: per_part``.  labels [N], margin [N] as in ``PartMotions`` (zero when
     no parts were discovered).  paired [N] bool: has an observed centre in both states, mu0 and mu1 [N, 3] (zero elsewhere).
     offsets [N, 2, 3]: position at state 0 and 1 minus canonical position where no motion is known (the paper's chords), else None.
+    diagnostics: what fusion counted.
     """
 
     gaussians: GaussianTensors
@@ -59,6 +60,7 @@ class CanonicalGaussians:
     mu0: Tensor
     mu1: Tensor
     offsets: Optional[Tensor] = None
+    diagnostics: dict = field(default_factory=dict)
 
     @property
     def canonical_times(self) -> Tensor:

@@ -79,21 +79,30 @@ def find_part_motions(
     say("looking for parts")
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
     explanations = _explanations(found)[: max(config.candidates, 1)]
-    best, costs, level = None, [], config.coarse.levels[-1]
+    best, costs, tried, level = None, [], [], config.coarse.levels[-1]
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
             say(f"re-rendering explanation {number + 1} of {len(explanations)}")
         motions = refine(states, motions, views, config.coarse, seed=seed, backend=backend, device=device)
-        motions = simplify(states, motions, views, config, backend=backend, device=device)
+        reductions: list[dict] = []
+        motions = simplify(states, motions, views, config, backend=backend, device=device, log=reductions)
         cost = explanation_cost(states, motions, views, level, backend, device)
         costs.append(cost)
         rank = cost * (1 + config.part_penalty) ** len(motions)
+        tried.append({"types": motions.types, "cost": cost, "rank": rank, "reductions": reductions})
         if best is None or rank < best[0]:
             best = (rank, motions, number)
     motions = best[1]
     motions = settle_types(states, motions, views, config, seed=seed, backend=backend, device=device)
-    motions.diagnostics = {"explanation": best[2], "photometric_costs": costs, **_plain(found.diagnostics)}
+    motions.diagnostics = {
+        "explanation": best[2],
+        "photometric_costs": costs,
+        "explanations": tried,
+        "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],  # of the Gaussians above min_opacity
+        "min_opacity": config.min_opacity,
+        **_plain(found.diagnostics),
+    }
     return motions
 
 
@@ -133,11 +142,14 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
 def refine(
     states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu", types=None, both: bool = True
 ) -> PartMotions:
-    """Photometric refinement of all motions: start into end images, then end into start images; the mean."""
+    """Photometric refinement of all motions: start into end images, then end into start images; the mean.
+
+    The result's ``diagnostics["polish"]`` holds both ("forward", "backward", each start -> end) and their last losses.
+    """
     if config.steps <= 0 or len(motions) == 0:
         return motions
     types = types or motions.types
-    forward, _ = polish(
+    forward, there = polish(
         states[0].gaussians,
         polish_labels(motions, 0, config.min_margin),
         motions.transforms,
@@ -148,9 +160,9 @@ def refine(
         backend=backend,
         device=device,
     )
-    result = forward
+    result, ways = forward, {"forward": forward, "loss_forward": there["loss"]}
     if both:
-        backward, _ = polish(
+        backward, back = polish(
             states[1].gaussians,
             polish_labels(motions, 1, config.min_margin),
             se3.inverse(forward),
@@ -162,7 +174,8 @@ def refine(
             device=device,
         )
         result = torch.stack([average_motion(a, se3.inverse(b)) for a, b in zip(forward, backward)])
-    return PartMotions(motions.types, result, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
+        ways |= {"backward": se3.inverse(backward), "loss_backward": back["loss"]}
+    return PartMotions(motions.types, result, motions.confidence, motions.labels, motions.margin, {**motions.diagnostics, "polish": ways})
 
 
 def explanation_cost(states, motions: PartMotions, views, level: int, backend: str, device="cpu") -> float:
@@ -176,8 +189,13 @@ def explanation_cost(states, motions: PartMotions, views, level: int, backend: s
     return 0.5 * (there + back)
 
 
-def simplify(states, motions: PartMotions, views, config: PartMotionsConfig, *, backend: str, device="cpu") -> PartMotions:
-    """Make one of touching parts with one motion, and drop parts without which the images are explained as well."""
+def simplify(
+    states, motions: PartMotions, views, config: PartMotionsConfig, *, backend: str, device="cpu", log: list[dict] | None = None
+) -> PartMotions:
+    """Make one of touching parts with one motion, and drop parts without which the images are explained as well.
+
+    log: told of each part that goes: what was done, its type, image loss with and without it, the loss that was allowed.
+    """
     cost = explanation_cost(states, motions, views, config.coarse.levels[-1], backend, device)
     tried: set[tuple] = set()
     while len(motions):
@@ -190,6 +208,9 @@ def simplify(states, motions: PartMotions, views, config: PartMotionsConfig, *, 
             penalty = config.merge_penalty if change[0] == "merge" else config.part_penalty
             if lower <= cost * (1 + penalty):
                 found = (reduced, lower)
+                if log is not None:
+                    gone = {"change": change[0], "type": motions.types[change[1]], "cost_with": cost, "cost_without": lower}
+                    log.append({**gone, "allowed": cost * (1 + penalty)})
                 break
         if found is None:
             return motions

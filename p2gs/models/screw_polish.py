@@ -77,7 +77,7 @@ class MovedGaussians:
                 sh[rows] = rotate_sh(sh[rows], transforms[k, :3, :3])
         return means, quats, sh
 
-    def render(self, means: Tensor, quats: Tensor, sh: Tensor, camera: Camera, background: Tensor, backend: str):
+    def render(self, means: Tensor, quats: Tensor, sh: Tensor, camera: Camera, background: Tensor, backend: str, features=None):
         camera, background = camera.to(self.device), background.to(self.device)
         return rasterize(
             means,
@@ -90,6 +90,7 @@ class MovedGaussians:
             camera.width,
             camera.height,
             background=background,
+            features=features,
             backend=backend,
         )
 
@@ -154,11 +155,11 @@ def polish(
     """Refine ``transforms`` [K-1, 4, 4] (this state -> the views' state) so that the moved Gaussians match the views.
 
     labels [N]: part of each Gaussian, -1 leaves it out.  types: "revolute" | "prismatic" | "free" per movable part.
-    Returns (transforms float64, {"loss": mean loss over the last tenth, "curvature": [K-1, 6] mean squared gradients there}).
+    Returns (transforms float64, {"loss": mean loss over the last tenth}).
     """
     transforms = transforms.double().clone()
     if config.steps <= 0 or len(transforms) == 0:
-        return transforms, {"loss": float("nan"), "curvature": torch.zeros(len(transforms), 6)}
+        return transforms, {"loss": float("nan")}
     solid = torch.sigmoid(gaussians.opacity_logits) > config.min_opacity
     body = MovedGaussians(gaussians, torch.where(solid, labels, -1), device)
     rows = [body.rows(k + 1) for k in range(len(transforms))]
@@ -197,7 +198,7 @@ def polish(
     for k, kind in enumerate(types):
         if kind == "revolute":
             transforms[k] = se3.project_revolute(transforms[k])  # what pitch the last steps left
-    return transforms, {"loss": sum(losses) / max(len(losses), 1), "curvature": second}
+    return transforms, {"loss": sum(losses) / max(len(losses), 1)}
 
 
 @torch.no_grad()
