@@ -15,6 +15,7 @@ from torch import Tensor
 
 from p2gs.data.box import mask_bounds
 from p2gs.data.images import premultiply, resize_area, resize_nearest, to_uint8
+from p2gs.ops.pixels import compose
 from p2gs.types import Camera, View
 
 
@@ -122,7 +123,5 @@ class TrainingViews:
     def get(self, index: int, level: int, background: Tensor) -> TargetImage:
         """View ``index`` at pyramid level ``level`` composited over ``background`` [3] (float32, 0..1): c + (1 - alpha) * background."""
         s = self._stored[index][level]
-        alpha = s.alpha.float().mul_(1 / 255)
-        image = s.colour.float().mul_(1 / 255)
-        image.addcmul_((1 - alpha).unsqueeze(-1), background)
+        image, alpha = compose(s.colour, s.alpha, background)
         return TargetImage(image, alpha, s.depth, s.key, s.camera)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs, register_loss
+from p2gs.ops.pixels import depth_spread
 
 
 @register_loss("depth")
@@ -44,5 +45,4 @@ class DepthVariance(Loss):
         render, target = inputs.render, inputs.target
         if render is None or target is None or render.depth_sq is None:
             return None
-        inside = (target.alpha > 0.5).to(render.alpha.dtype)
-        return 2 * (render.depth_variance * inside).sum() / inside.sum().clamp_min(1)
+        return 2 * depth_spread(render.alpha, render.depth, render.depth_sq, target.alpha, render.depth_ref)

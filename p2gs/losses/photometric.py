@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs, register_loss
+from p2gs.ops.pixels import clamped_cross_entropy
 from p2gs.ops.ssim import l1_ssim
 
 
@@ -37,7 +38,7 @@ class Alpha(Loss):
     def compute(self, inputs: LossInputs) -> Tensor | None:
         if inputs.render is None or inputs.target is None:
             return None
-        return F.binary_cross_entropy(inputs.render.alpha.clamp(self.eps, 1 - self.eps), inputs.target.alpha)
+        return clamped_cross_entropy(inputs.render.alpha, inputs.target.alpha, self.eps)
 
 
 @register_loss("opacity")

@@ -19,6 +19,7 @@ T* pointer(Address a) {
 
 void bind_adam(nb::module_& m);
 void bind_blend(nb::module_& m);
+void bind_image(nb::module_& m);
 void bind_ssim(nb::module_& m);
 void bind_knn(nb::module_& m);
 void bind_raster(nb::module_& m);

@@ -9,6 +9,7 @@
 
 #include "adam.h"
 #include "blend.h"
+#include "image.h"
 #include "knn.h"
 #include "raster.h"
 #include "ssim.h"
@@ -19,6 +20,7 @@ struct Kernels {
     const char* isa;
     AdamKernels adam;
     BlendKernels blend;
+    ImageKernels image;
     SsimKernels ssim;
     RasterKernels raster;
     KnnKernels knn;

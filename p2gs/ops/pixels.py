@@ -1,0 +1,87 @@
+"""Sums over the pixels of a training view with their gradients: one native pass each on the CPU, torch elsewhere."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from p2gs.native import native, num_threads
+
+
+def _fast(*tensors: Tensor) -> bool:
+    return native is not None and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
+
+
+def _same_shape(name: str, *tensors: Tensor) -> None:
+    if any(t.shape != tensors[0].shape for t in tensors):
+        raise ValueError(f"{name} wants tensors of one shape, got {', '.join(str(tuple(t.shape)) for t in tensors)}")
+
+
+def clamped_cross_entropy(pred: Tensor, target: Tensor, eps: float) -> Tensor:
+    """Mean binary cross-entropy of pred, clamped to [eps, 1 - eps], against target in 0..1 of the same shape: a scalar.
+
+    Differentiable by pred (zero where it is clamped). Raises ValueError for shapes that differ.
+    """
+    _same_shape("clamped_cross_entropy", pred, target)
+    if not _fast(pred, target) or target.requires_grad or not 1e-6 <= eps < 0.5 or pred.numel() == 0:
+        return F.binary_cross_entropy(pred.clamp(eps, 1 - eps), target)
+    return _CrossEntropy.apply(pred, target, float(eps))
+
+
+def depth_spread(alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float) -> Tensor:
+    """Mean of alpha depth_sq - (depth - ref alpha)^2 over the pixels with target > 1/2, a scalar; 0 where there are none.
+
+    alpha, depth, depth_sq: as accumulated by the rasterizer (``RenderOutput``), depth_sq about ``ref``; target: the photograph's alpha.
+    All of one shape; differentiable by the first three. Raises ValueError for shapes that differ.
+    """
+    _same_shape("depth_spread", alpha, depth, depth_sq, target)
+    if _fast(alpha, depth, depth_sq, target):
+        return _DepthSpread.apply(alpha, depth, depth_sq, target.detach(), float(ref))
+    inside = (target > 0.5).to(alpha.dtype)
+    first = depth - ref * alpha
+    return ((alpha * depth_sq - first * first) * inside).sum() / inside.sum().clamp_min(1)
+
+
+class _CrossEntropy(torch.autograd.Function):
+    """The gradient comes with the value and waits for the factor of the backward pass."""
+
+    @staticmethod
+    def forward(ctx, pred, target, eps):
+        pred, target = pred.contiguous(), target.contiguous()
+        ctx.grad = torch.empty_like(pred) if ctx.needs_input_grad[0] else None
+        address = 0 if ctx.grad is None else ctx.grad.data_ptr()
+        value = native.cross_entropy(pred.data_ptr(), target.data_ptr(), address, pred.numel(), eps, 1 - eps, num_threads())
+        return pred.new_tensor(value)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_output):
+        return ctx.grad * grad_output, None, None
+
+
+class _DepthSpread(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, alpha, depth, depth_sq, target, ref):
+        inputs = [t.contiguous() for t in (alpha, depth, depth_sq, target)]
+        ctx.grads = torch.empty(3, *alpha.shape) if any(ctx.needs_input_grad[:3]) else None
+        grads = [0, 0, 0] if ctx.grads is None else [g.data_ptr() for g in ctx.grads]
+        value = native.depth_spread([*(t.data_ptr() for t in inputs), *grads], alpha.numel(), ref, num_threads())
+        return alpha.new_tensor(value)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_output):
+        return *(ctx.grads * grad_output).unbind(0), None, None
+
+
+def compose(colour: Tensor, alpha8: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Premultiplied uint8 colour [H, W, 3] and alpha [H, W] over a background [3] in 0..1: float32 image [H, W, 3] and alpha [H, W]."""
+    if native is not None and colour.device.type == "cpu" and colour.is_contiguous() and alpha8.is_contiguous() and alpha8.numel():
+        image, alpha = torch.empty(colour.shape), torch.empty(alpha8.shape)
+        addresses = [t.data_ptr() for t in (colour, alpha8, image, alpha)]
+        native.compose(*addresses, background.tolist(), alpha.numel(), num_threads())
+        return image, alpha
+    alpha = alpha8.float().mul_(1 / 255)
+    image = colour.float().mul_(1 / 255)
+    return image.addcmul_((1 - alpha).unsqueeze(-1), background), alpha
