@@ -250,7 +250,7 @@ class Pipeline:
         """The twin and the result folder; returns what a later run needs to know of it."""
         from p2gs.export.run_folder import complete_run, write_twin
 
-        obj, notes = finish(
+        obj, notes, record = finish(
             learned,
             states,
             self.views,
@@ -266,7 +266,8 @@ class Pipeline:
         exports = self.cfg.phases["finish"].config.exports
         if exports:
             complete_run(self.run_dir, exports, log=partial(print, flush=True))
-        return {"parts": len(obj.parts), "notes": notes}
+        joints = [e.as_dict() for e in record.evidence]
+        return {"parts": len(obj.parts), "notes": notes, "joints": joints}
 
 
 def pick_device(name: str) -> torch.device:

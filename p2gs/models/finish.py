@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from p2gs.data.views import TrainingViews
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
+from p2gs.models.joint_confidence import JointEvidence, measure_joints, measuring_level, state_depth
 from p2gs.models.part_motions import refine
 from p2gs.models.phase import PHASES
-from p2gs.models.screw_polish import PolishConfig
+from p2gs.models.screw_polish import PolishConfig, photometric_cost
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
@@ -34,6 +36,25 @@ class FinishConfig:
     prismatic_below: float = 5.0
     clean_neighbours: int = 8
     exports: list[str] = field(default_factory=lambda: ["urdf", "mjcf", "glb"])
+
+
+@dataclass
+class FinishRecord:
+    """What the last stage measured, for the diagnosis.
+
+    labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the polish (start -> end,
+    internal units); polish: what ``refine`` tells of its two directions ({} without polish).  costs: image loss of the start's Gaussians in
+    the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.  slots: the learned slot of each part.
+    """
+
+    labels: list[Tensor]
+    margin: list[Tensor]
+    before: Tensor
+    after: Tensor
+    polish: dict = field(default_factory=dict)
+    costs: dict[str, list[float]] = field(default_factory=dict)
+    evidence: list[JointEvidence] = field(default_factory=list)
+    slots: list[int] = field(default_factory=list)
 
 
 @PHASES.register("finish")
@@ -114,8 +135,11 @@ def finish(
     seed: int,
     backend: str,
     device="cpu",
-) -> tuple[ArticulatedObject, list[str]]:
-    """The twin, and one line for each slot that vanished."""
+) -> tuple[ArticulatedObject, list[str], FinishRecord]:
+    """The twin, one line for each slot that vanished, and what was measured on the way.
+
+    views: photographs by state.  A part's confidence is ``JointEvidence.confidence`` of its joint.
+    """
     labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
     alive = surviving_slots(learned, labels, config)
     notes = [
@@ -128,24 +152,44 @@ def finish(
         remap[old] = new + 1
     labels = remap[labels]
     keep = torch.tensor([k - 1 for k in alive], dtype=torch.int64)
-    transforms, confidence = learned.transforms[keep], learned.confidence[keep]
+    transforms = learned.transforms[keep]
     types = name_types([learned.types[k - 1] for k in alive], transforms, config.prismatic_below)
     time = learned.canonical_time
     for k, kind in enumerate(types):
         rows = labels == k + 1
         start = se3.apply(se3.screw_at(transforms[k], -time), learned.gaussians.means[rows].double())
         transforms[k] = constrain(kind, transforms[k], start.mean(0))
+    found = [state_labels(learned, labels, s, transforms) for s in states]
+    record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive)
     if len(types):
-        found = [state_labels(learned, labels, s, transforms) for s in states]
-        motions = PartMotions(types, transforms, confidence, [f[0] for f in found], [f[1] for f in found])
-        transforms = refine(states, motions, views, config.polish, seed=seed, backend=backend, device=device).transforms
+        motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
+        refined = refine(states, motions, views, config.polish, seed=seed, backend=backend, device=device)
+        transforms = refined.transforms
+        record.after, record.polish = transforms, refined.diagnostics.get("polish", {})
+        measure(record, states, types, views, backend, device)
     parts = [Part(0, None, int((labels == 0).sum()))]
     for k, kind in enumerate(types):
         rows = labels == k + 1
         centre = learned.gaussians.means[rows].double().mean(0)
         joint = make_joint(kind, transforms[k], se3.apply(se3.screw_at(transforms[k], -time), centre[None])[0])
-        parts.append(Part(k + 1, joint, int(rows.sum()), float(confidence[k])))
-    return ArticulatedObject(learned.gaussians, labels, parts, time, similarity), notes
+        parts.append(Part(k + 1, joint, int(rows.sum()), record.evidence[k].confidence))
+    return ArticulatedObject(learned.gaussians, labels, parts, time, similarity), notes, record
+
+
+def measure(
+    record: FinishRecord, states: list[StateGaussians], types: list[str], views: dict[int, TrainingViews], backend: str, device
+) -> None:
+    """Fill in ``costs`` and ``evidence``."""
+    level = min(measuring_level(views[s]) for s in (0, 1))
+    options = {"level": level, "backend": backend, "device": device}
+    for name, T in (("before", record.before), ("after", record.after)):
+        ways = (T, se3.inverse(T))
+        record.costs[name] = [
+            photometric_cost(states[s].gaussians, record.labels[s], ways[s], views[1 - s], count=8, **options) for s in (0, 1)
+        ]
+    stacks = [state_depth(state, views[s], level, backend=backend, device=device) for s, state in enumerate(states)]
+    both = [record.polish[w] for w in ("forward", "backward")] if "backward" in record.polish else None
+    record.evidence = measure_joints(states, record.labels, record.after, types, views, stacks, both=both, **options)
 
 
 def make_joint(kind: str, transform: Tensor, centre: Tensor) -> Joint:

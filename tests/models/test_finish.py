@@ -76,6 +76,6 @@ def test_empty_and_unmoving_slots_vanish_with_a_word():
     learned = Articulation(states[0].gaussians, probs, ["prismatic"] * 3, torch.stack([slide(), idle, slide()]), torch.ones(3), 0.0)
     config = FinishConfig(polish=PolishConfig(steps=0), clean_neighbours=0)
     assert surviving_slots(learned, learned.part_ids, config) == [1]
-    twin, notes = finish(learned, states, views, config, Similarity(), seed=0, backend="auto")
+    twin, notes, _ = finish(learned, states, views, config, Similarity(), seed=0, backend="auto")
     assert len(twin.parts) == 2 and len(notes) == 2 and "slot 2 of 3 vanished" in notes[0]
     assert twin.parts[1].joint.type == "prismatic" and int(twin.part_ids.max()) == 1
