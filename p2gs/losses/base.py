@@ -21,6 +21,8 @@ from typing import Optional
 
 from torch import Tensor
 
+from p2gs.ops import se3
+from p2gs.ops.blend import part_motions
 from p2gs.registry import Registry
 from p2gs.types import Camera, GaussianTensors, RenderOutput
 
@@ -51,6 +53,7 @@ class PartState:
     knn [N, k] int64: neighbours in canonical space, self excluded.  target_rotation [K, 3, 3]: detached Kabsch fit of the pairs.
     repel_points [R, 3] in state-0 coordinates, or None.  extent: diagonal of the object's box.  spacing: median nearest-neighbour
     distance of the Gaussians.  hardness in [0, 1]: how far the soft-to-hard schedule has come.
+    twists [K-1, 6]: logarithms of the movable parts' transforms where the phase has them at hand.
     """
 
     probs: Tensor
@@ -66,6 +69,14 @@ class PartState:
     target_rotation: Optional[Tensor] = None
     repel_points: Optional[Tensor] = None
     hardness: float = 0.0
+    twists: Optional[Tensor] = None
+
+    def at(self, time: float) -> Tensor:
+        """Motions [K, 4, 4] from canonical time to ``time`` (0 start, 1 end)."""
+        span = time - self.canonical_time
+        if self.twists is None:
+            return se3.screw_at(self.transforms, span)
+        return part_motions(self.twists * (span[1:, None].to(self.twists) if isinstance(span, Tensor) else span))
 
 
 @dataclass

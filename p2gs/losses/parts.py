@@ -38,11 +38,14 @@ class Part(Loss):
         if parts is None or parts.knn is None or parts.knn.shape[1] == 0:
             return None
         rows = sample_rows(len(parts.probs), self.sample, inputs.step, parts.probs.device)
-        own, others = parts.probs[rows], parts.probs[parts.knn[rows]]
+        # [K, neighbours, M]: torch is several times slower with the few parts or neighbours last
+        probs, neighbours = parts.probs.T, parts.knn[rows].T
+        own = probs[:, None] if isinstance(rows, slice) else probs.index_select(1, rows)[:, None]
+        others = probs.index_select(1, neighbours.reshape(-1)).unflatten(1, neighbours.shape)
         if self.variant == "mean_neighbour":
             others = others.mean(1, keepdim=True)
-        log_ratio = own.clamp_min(TINY).log()[:, None] - others.clamp_min(TINY).log()
-        divergence = (own[:, None] * log_ratio).sum(-1).mean(1)
+        log_ratio = own.clamp_min(TINY).log() - others.clamp_min(TINY).log()
+        divergence = (own * log_ratio).sum(0).mean(0)
         return divergence.mean() * (1 if self.reduce == "mean" else len(parts.probs))
 
 

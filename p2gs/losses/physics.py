@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs, register_loss
-from p2gs.losses.motion import select_pairs
+from p2gs.losses.motion import carried, select_pairs
 from p2gs.losses.parts import sample_rows
-from p2gs.ops import se3
+from p2gs.ops.blend import likeliest
 from p2gs.ops.knn import knn
 
 
@@ -37,11 +37,11 @@ class Velocity(Loss):
         weights = pairs.probs.T
         weights = weights / weights.sum(1, keepdim=True).clamp_min(1.0)
         if self.variant == "rigid":
-            displacement = se3.apply(inputs.parts.transforms, pairs.mu0) - pairs.mu1
+            displacement = carried(inputs.parts.transforms, pairs.mu0) - pairs.mu1.T
         else:
-            displacement = (pairs.mu1 - pairs.mu0).expand(len(weights), -1, -1)
-        mean = (weights[..., None] * displacement).sum(1, keepdim=True) / weights.sum(1)[:, None, None].clamp_min(1e-12)
-        variance = (weights * (displacement - mean).square().sum(-1)).sum(1)
+            displacement = (pairs.mu1 - pairs.mu0).T.expand(len(weights), -1, -1)
+        mean = (weights[:, None] * displacement).sum(2, keepdim=True) / weights.sum(1)[:, None, None].clamp_min(1e-12)
+        variance = (weights * (displacement - mean).square().sum(1)).sum(1)
         return variance.mean() if self.reduce == "mean" else variance.sum()
 
 
@@ -68,16 +68,17 @@ class Contact(Loss):
         parts = inputs.parts
         if parts is None or len(parts.transforms) < 2:
             return None
-        labels = parts.probs.detach().argmax(1)
+        labels = likeliest(parts.probs)
         static, movable = (labels == 0).nonzero()[:, 0], (labels > 0).nonzero()[:, 0]
         if len(static) == 0 or len(movable) == 0:
             return None
         movable = movable[sample_rows(len(movable), self.sample, inputs.step, movable.device)]
-        base, label = parts.means_canonical[static], labels[movable]
-        pose = se3.screw_at(parts.transforms, self.times[inputs.step % len(self.times)] - parts.canonical_time)[label]
-        points = (pose[:, :3, :3] @ parts.means_canonical[movable, :, None])[..., 0] + pose[:, :3, 3]
-        _, nearest = knn(base.detach(), points.detach(), 1, False)
-        from_base, from_centre = points - base[nearest[:, 0]], points - base.mean(0)
+        means, label = parts.means_canonical, labels[movable]
+        pose = parts.at(self.times[inputs.step % len(self.times)])[label]
+        points = (pose[:, :3, :3] * means[movable, None, :]).sum(-1) + pose[:, :3, 3]
+        _, nearest = knn(means.detach()[static], points.detach(), 1, False)
+        centre = ((labels == 0).to(means)[None] @ means)[0] / len(static)
+        from_base, from_centre = points - means[static[nearest[:, 0]]], points - centre
         cosine = torch.cosine_similarity(from_base, from_centre, dim=-1, eps=1e-12)
         penalty = (-cosine).clamp_min(0)
         if self.variant == "margin":

@@ -159,8 +159,8 @@ class ArticulationPhase(ImagePhase):
         mu0, mu1 = self.splats.mu0[pairs], self.splats.mu1[pairs]
         target_rotation = None
         if self._active("art") and pairs.numel() >= 3:
-            weights = probs.detach()[pairs].T + 1e-9
-            target_rotation = so3.kabsch(mu0.expand(len(weights), -1, 3), mu1.expand(len(weights), -1, 3), weights)[0]
+            weights = probs.detach().T.index_select(1, pairs) + 1e-9
+            target_rotation = so3.kabsch(mu0, mu1, weights)[0]
         hardness = (self.config.temperature - self.temperature(self.step)) / max(
             self.config.temperature - self.config.temperature_end, 1e-9
         )
@@ -179,6 +179,7 @@ class ArticulationPhase(ImagePhase):
             target_rotation=target_rotation,
             repel_points=self.repel_points if len(self.repel_points) else None,
             hardness=hardness,
+            twists=self.screws.xi,
         )
 
     @torch.no_grad()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from p2gs.models.canonical import with_static
 from p2gs.ops import blend, se3, so3
 from p2gs.types import GaussianTensors
 
@@ -19,11 +18,11 @@ class PartScrews(nn.Module):
 
     def transforms(self) -> Tensor:
         """[K, 4, 4], identity in slot 0."""
-        return with_static(se3.exp(self.xi))
+        return blend.part_motions(self.xi)
 
     def at(self, span: Tensor) -> Tensor:
         """Motions exp(span_k xi_k) of slots 0..K-1, [K, 4, 4]; span [K] (state time minus canonical time)."""
-        return with_static(se3.exp(self.twists(span)))
+        return blend.part_motions(self.twists(span))
 
     def twists(self, span: Tensor) -> Tensor:
         """span_k xi_k of the movable parts, [K-1, 6]; span [K] as in ``at``."""

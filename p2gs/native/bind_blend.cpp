@@ -32,6 +32,16 @@ void bind_blend(nb::module_& m) {
         },
         "addresses (means, quats, probs, twists as in forward; gradients by the moved means and quats, 0 = none; gradients to means, quats, "
         "probs, twists), n, parts, threads");
+    m.def(
+        "part_motions",
+        [](Address twists, Address out, int parts) { part_motions(parts, pointer<const float>(twists), pointer<float>(out)); },
+        "twists [parts - 1, 6] to motions [parts, 4, 4], slot 0 the identity");
+    m.def(
+        "part_motions_backward",
+        [](Address twists, Address grad, Address v_twists, int parts) {
+            part_motions_backward(parts, pointer<const float>(twists), pointer<const float>(grad), pointer<float>(v_twists));
+        },
+        "gradient [parts, 4, 4] by the motions to the twists' [parts - 1, 6]");
 }
 
 }  // namespace p2gs

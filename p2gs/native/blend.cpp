@@ -148,4 +148,20 @@ void blend_backward(BlendArgs args, const float* twists, float* v_twists, int th
     }
 }
 
+void part_motions(int parts, const float* twists, float* out) {
+    const std::vector<float> motions = motions_of(parts, twists);
+    for (int k = 0; k < parts; ++k) {
+        for (int i = 0; i < 12; ++i) out[16 * k + i] = motions[k * kMotion + i];
+        for (int i = 12; i < 16; ++i) out[16 * k + i] = i == 15;
+    }
+}
+
+void part_motions_backward(int parts, const float* twists, const float* grad, float* v_twists) {
+    for (int k = 1; k < parts; ++k) {
+        double g[kMotion] = {};
+        for (int i = 0; i < 12; ++i) g[i] = grad[16 * k + i];
+        Motion(twists + 6 * (k - 1)).gradient(g, v_twists + 6 * (k - 1));
+    }
+}
+
 }  // namespace p2gs

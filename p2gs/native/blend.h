@@ -30,4 +30,8 @@ struct BlendKernels {
 void blend_forward(BlendArgs args, const float* twists, int threads);
 void blend_backward(BlendArgs args, const float* twists, float* v_twists, int threads);
 
+// The motions themselves: [parts, 4, 4], slot 0 the identity, and the gradient from there (the last rows' is not read).
+void part_motions(int parts, const float* twists, float* out);
+void part_motions_backward(int parts, const float* twists, const float* grad, float* v_twists);
+
 }  // namespace p2gs

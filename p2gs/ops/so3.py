@@ -160,9 +160,11 @@ def kabsch(src: Tensor, dst: Tensor, weights: Optional[Tensor] = None) -> tuple[
     if weights is None:
         weights = torch.ones_like(src[..., 0])
     total = weights.sum(-1, keepdim=True)
-    w = (weights / torch.where(total > 0, total, torch.ones_like(total)))[..., None]
-    src_mean, dst_mean = (w * src).sum(-2), (w * dst).sum(-2)
-    H = (w * (src - src_mean[..., None, :])).transpose(-1, -2) @ (dst - dst_mean[..., None, :])
+    w = (weights / torch.where(total > 0, total, torch.ones_like(total)))[..., None, :]
+    # points last: torch is several times slower with the three coordinates there
+    src, dst = src.transpose(-1, -2).contiguous(), dst.transpose(-1, -2).contiguous()
+    src_mean, dst_mean = (w * src).sum(-1), (w * dst).sum(-1)
+    H = (w * (src - src_mean[..., None])) @ (dst - dst_mean[..., None]).transpose(-1, -2)
     U, _, Vh = torch.linalg.svd(H)
     V, Ut = Vh.transpose(-1, -2), U.transpose(-1, -2)
     flip = torch.ones_like(H[..., 0])

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from p2gs.ops.blend import blend_move, blend_move_reference
+from p2gs.ops import se3
+from p2gs.ops.blend import blend_move, blend_move_reference, likeliest, part_motions
 
 
 def setting(n=777, parts=4, seed=0, turn=1.0):
@@ -106,3 +107,22 @@ def test_shapes_that_do_not_fit():
     means, quats, probs, twists = setting(10, 3)
     with pytest.raises(ValueError, match="blend_move wants"):
         blend_move(means, quats, probs, twists[:1])
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-4, 0.2, 0.29, 1.0, 3.6])
+def test_motions_of_twists(turn):
+    twists = setting(1, 4, turn=turn)[3]
+    if turn:
+        twists[:, :3] *= turn / twists[:, :3].norm(dim=1, keepdim=True)
+    direction = torch.randn(4, 4, 4, generator=torch.Generator().manual_seed(1))
+    a, b = twists.clone().requires_grad_(), twists.double().requires_grad_()
+    ours, exact = part_motions(a), torch.cat([torch.eye(4).double()[None], se3.exp(b)])
+    assert_close([ours.detach()], [exact.detach()])
+    assert_close(torch.autograd.grad(ours, a, direction), torch.autograd.grad(exact, b, direction.double()))
+
+
+def test_likeliest_is_argmax_and_takes_the_first_of_equals():
+    probs = torch.randint(0, 3, (1000, 4), generator=torch.Generator().manual_seed(0)).float()
+    first = torch.tensor([row.index(max(row)) for row in probs.tolist()])
+    assert torch.equal(likeliest(probs), first) and torch.equal(likeliest(probs.T.contiguous().T), first)
+    assert torch.equal(likeliest(probs[:, :1]), torch.zeros(1000, dtype=torch.int64))
