@@ -22,6 +22,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.models import handover
 from p2gs.models.articulation import ArticulationPhase
 from p2gs.models.canonical_fusion import CanonicalFusionPhase
+from p2gs.models.diagnosis import StageResults
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.finish import finish
@@ -131,7 +132,7 @@ class Pipeline:
         )
         if only == "articulation":
             return self.run_dir
-        self.stage("finish", only, lambda: self.write(learned, states))
+        self.stage("finish", only, lambda: self.write(learned, states, canonical, motions))
         return self.run_dir
 
     def stage(self, name: str, only: Optional[str], make: Callable[[], Any]) -> Any:
@@ -246,26 +247,30 @@ class Pipeline:
         print(f"{stage}: going on from {path}", flush=True)
         return str(path)
 
-    def write(self, learned: handover.Articulation, states) -> dict:
+    def write(self, learned: handover.Articulation, states, canonical, motions) -> dict:
         """The twin and the result folder; returns what a later run needs to know of it."""
+        from p2gs.export.diagnostics_page import write_diagnosis
         from p2gs.export.run_folder import complete_run, write_twin
 
+        config, device = self.cfg.phases["finish"].config, self.device
         obj, notes, record = finish(
             learned,
             states,
             self.views,
-            self.cfg.phases["finish"].config,
+            config,
             self.scene.similarity,
             seed=self.cfg.seed,
             backend=self.cfg.rasterizer,
-            device=self.device,
+            device=device,
         )
         for note in notes:
             print(note, flush=True)
+        stages = StageResults(states, motions, canonical, learned, record, notes)
+        options = {"min_margin": config.polish.min_margin, "backend": self.cfg.rasterizer, "device": device}
+        write_diagnosis(self.run_dir, stages, obj, self.views, **options)
         write_twin(obj, self.run_dir, self.scene)
-        exports = self.cfg.phases["finish"].config.exports
-        if exports:
-            complete_run(self.run_dir, exports, log=partial(print, flush=True))
+        if config.exports:
+            complete_run(self.run_dir, config.exports, log=partial(print, flush=True))
         joints = [e.as_dict() for e in record.evidence]
         return {"parts": len(obj.parts), "notes": notes, "joints": joints}
 

@@ -33,6 +33,7 @@ def write_report(run_dir: Path | str) -> Path:
         view_section(run_dir, obj),
         picture_section(run_dir),
         joint_section(obj, metrics),
+        doubt_section(run_dir),
         score_section(metrics),
         curve_section(run_dir / "logs"),
         time_section(_json(run_dir / "logs" / "stages.json")),
@@ -122,6 +123,15 @@ def joint_section(obj: ArticulatedObject, metrics: Optional[dict]) -> str:
             moving += 1
         rows.append(cells)
     return "<h2>Parts and joints</h2>\n" + table(head, rows)
+
+
+def doubt_section(run_dir: Path) -> str:
+    """A link to the diagnosis, with its warnings."""
+    d = _json(run_dir / "diagnostics.json")
+    if d is None:
+        return ""
+    items = "".join(f"<li>{html.escape(v['text'])}</li>" for v in d["verdict"] if v["level"] == "warning")
+    return f'<p><a href="diagnostics.html">Diagnosis of every stage</a></p><ul class="notes">{items}</ul>'
 
 
 def score_section(metrics: Optional[dict]) -> str:

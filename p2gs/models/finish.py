@@ -42,9 +42,10 @@ class FinishConfig:
 class FinishRecord:
     """What the last stage measured, for the diagnosis.
 
-    labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the polish (start -> end,
-    internal units); polish: what ``refine`` tells of its two directions ({} without polish).  costs: image loss of the start's Gaussians in
-    the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.  slots: the learned slot of each part.
+    labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the polish
+    (start -> end, internal units); polish: what ``refine`` tells of its two directions ({} without polish).  costs: image loss of the
+    start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.  slots: the
+    learned slot of each part.
     """
 
     labels: list[Tensor]

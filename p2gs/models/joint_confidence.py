@@ -91,7 +91,9 @@ def measuring_level(views: TrainingViews, size: int = 200) -> int:
     return max((n for n in views.levels if n <= size), default=min(views.levels))
 
 
-def state_depth(state: StateGaussians, views: TrainingViews, level: int, count: int = 24, backend: str = "auto", device="cpu") -> DepthStack:
+def state_depth(
+    state: StateGaussians, views: TrainingViews, level: int, count: int = 24, backend: str = "auto", device="cpu"
+) -> DepthStack:
     """Rendered depth of a state in ``count`` of its views, a quarter wider on each side than the photographs' crops."""
     cameras = []
     for i in torch.linspace(0, len(views) - 1, min(count, len(views))).round().long().tolist():
@@ -153,7 +155,7 @@ class CrossViews:
         self.windows = [[self.window(i, near[i][k + 1]) for i in rows] for k, rows in enumerate(self.chosen)]
         still = [(s[..., 0] > 0.5) & ~n[1:].any(0) for s, n in zip(self.shares, near, strict=True)]
         total = sum(int(m.sum()) for m in still)
-        self.static_error = sum(float(e[m].sum()) for e, m in zip(self.errors, still, strict=True)) / total if total else float("nan")
+        self.static_error = sum(float(e[m].sum()) for e, m in zip(self.errors, still, strict=True)) / max(total, 1)
 
     def draw(self, transforms: Tensor, camera: Camera, features: bool = False) -> tuple[Tensor, Tensor | None]:
         """Colour [H, W, 3] and, if asked for, how much of each pixel each part covers [H, W, K]."""
@@ -189,18 +191,18 @@ class CrossViews:
 @torch.no_grad()
 def measure_joints(
     states: list[StateGaussians], labels: list[Tensor], transforms: Tensor, types: list[str], views: dict[int, TrainingViews],
-    stacks: list[DepthStack], *, level: int, both: list[Tensor] | None = None, backend: str = "auto", device="cpu",
+    stacks: list[DepthStack], *, level: int, both: list[Tensor] | None = None, looks: int = 16, count: int = 5, backend: str = "auto",
+    device="cpu",
 ) -> list[JointEvidence]:  # fmt: skip
     """The evidence for every joint.
 
     labels: part ids of each state's Gaussians.  transforms [K-1, 4, 4] start -> end.  views: photographs by state.  stacks: rendered
     depth of both states.  level: image size.  both: the motions that the start -> end and the end -> start refinement found
-    (both start -> end), where there were two.
+    (both start -> end), where there were two.  looks, count: as in ``CrossViews``.
     """
     ways = [transforms.double(), se3.inverse(transforms.double())]
-    crossed = [
-        CrossViews(states[s], labels[s], ways[s], views[1 - s], level=level, backend=backend, device=device) for s in (0, 1)
-    ]
+    options = {"level": level, "looks": looks, "count": count, "backend": backend, "device": device}
+    crossed = [CrossViews(states[s], labels[s], ways[s], views[1 - s], **options) for s in (0, 1)]
     landed = [landing(states[s], labels[s], ways[s], stacks[1 - s]) for s in (0, 1)]
     out = []
     for k, kind in enumerate(types):
@@ -218,7 +220,7 @@ def measure_joints(
             JointEvidence(
                 coverage=max(way[k][0] for way in landed),
                 contradicted=max(way[k][1] for way in landed),
-                residual=base / static if static > 0 else float("nan"),
+                residual=base / max(static, 1e-3) if here else float("nan"),
                 rise=min(rises, default=0.0),
                 fall=max(falls),
                 disagreement=parted(states[0], labels[0], k, *both) if both is not None else 0.0,
