@@ -29,6 +29,7 @@ from p2gs.models.finish import finish
 from p2gs.models.part_motions import find_part_motions
 from p2gs.models.phase import Phase
 from p2gs.models.single_state import SingleStatePhase
+from p2gs.native import keep_memory
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError
 
 STAGES = ("single_state", "discovery", "canonical_fusion", "articulation", "finish")
@@ -46,6 +47,7 @@ class Pipeline:
         self.cfg = cfg
         self.run_dir = cfg.run_dir
         self.device = pick_device(cfg.device)
+        keep_memory()
         if cfg.threads:
             torch.set_num_threads(cfg.threads)
         missing = [name for name in STAGES if name not in cfg.phases]

@@ -35,6 +35,15 @@ def num_threads() -> int:
     return torch.get_num_threads()
 
 
+def keep_memory() -> None:
+    """For a process that trains: malloc keeps what a step frees for the next one (up to 1 GiB), which saves the page faults.
+
+    For the whole process, and for good; only with glibc. Importing p2gs does not do it, ``p2gs fit`` does.
+    """
+    if native is not None:
+        native.keep_memory()
+
+
 _warned = False
 
 

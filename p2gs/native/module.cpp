@@ -5,6 +5,11 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <cstdlib>
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
+
 #include <atomic>
 #include <stdexcept>
 #include <string>
@@ -30,6 +35,15 @@ NB_MODULE(_native, m) {
             return names;
         },
         "Instruction sets this machine runs, best first.");
+    m.def(
+        "keep_memory",
+        [] {
+#if defined(__GLIBC__)
+            mallopt(M_MMAP_THRESHOLD, 32 << 20);  // the largest value glibc takes
+            mallopt(M_TRIM_THRESHOLD, 1 << 30);
+#endif
+        },
+        "Have malloc keep freed memory for the next step instead of giving it back to the system and faulting it in again.");
     m.def("pool_size", &pool_size, "Helper threads of the pool alive in this process.");
     m.def(
         "pool_test",
