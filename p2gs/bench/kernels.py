@@ -153,6 +153,7 @@ def gradient_error(n: int, px: int, device: str, backend: str) -> float:
 def bench_kernels(device: str = "cpu", json_path: Optional[str] = None, quick: bool = False, all_isas: bool = False) -> list[Row]:
     """Measure, print a table, write the rows as JSON where a path is given, and return them.
 
+    json_path: a file, or "-" for standard output (the table then goes to standard error).
     device: "cpu" (one and all threads, against ``torch_ref``) or "cuda".  quick: fewer sizes and repetitions, under a minute.
     all_isas: every instruction set that this machine runs instead of the one in use.  Raises UserError when there is nothing to time.
     """
@@ -187,13 +188,17 @@ def bench_kernels(device: str = "cpu", json_path: Optional[str] = None, quick: b
         torch.set_num_threads(before_threads)
         if native is not None:
             native.set_isa(before_isa)
-    _print(rows)
+    _print(rows, to_stderr=json_path == "-")
     if json_path is not None:
-        Path(json_path).write_text(json.dumps([asdict(r) for r in rows], indent=1), encoding="utf-8")
+        text = json.dumps([asdict(r) for r in rows], indent=1)
+        if json_path == "-":
+            print(text)
+        else:
+            Path(json_path).write_text(text, encoding="utf-8")
     return rows
 
 
-def _print(rows: list[Row]) -> None:
+def _print(rows: list[Row], to_stderr: bool = False) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -207,14 +212,14 @@ def _print(rows: list[Row]) -> None:
             *("" if f is None else f"{f:.1f}" if f < 100 else f"{f:.0f}" for f in figures),
             "" if r.speedup is None else f"{r.speedup:.0f}x", "" if r.rel_grad_err is None else f"{r.rel_grad_err:.0e}",
         )  # fmt: skip
-    Console().print(table)
+    Console(stderr=to_stderr).print(table)
 
 
 def main(words: list[str]) -> int:
     """``p2gs bench kernels``: the arguments behind these words; returns the exit code."""
     parser = argparse.ArgumentParser(prog="p2gs bench kernels", description="Time the rasterizer and the training step on this machine.")
     parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
-    parser.add_argument("--json", dest="json_path", metavar="FILE", help="also write the rows there")
+    parser.add_argument("--json", dest="json_path", nargs="?", const="-", metavar="FILE", help="also write the rows there, or to standard output")
     parser.add_argument("--quick", action="store_true", help="fewer sizes, under a minute")
     parser.add_argument("--all-isas", action="store_true", help="every instruction set this machine runs")
     bench_kernels(**vars(parser.parse_args(words)))

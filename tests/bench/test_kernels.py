@@ -39,6 +39,9 @@ def test_rows_and_json(tmp_path, monkeypatch, capsys):
     assert len([r for r in rows if r["backend"] == "torch_ref"]) == 2
     assert torch.get_num_threads() == 2 and native.isa() == isa
     assert "torch_ref" in capsys.readouterr().out
+    assert kernels.main(["--quick", "--json"]) == 0  # no file: the rows alone on standard output
+    out, err = capsys.readouterr()
+    assert {r["backend"] for r in json.loads(out)} == {"cpu", "torch_ref"} and "torch_ref" in err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
