@@ -80,7 +80,9 @@ def page(d: dict, strips: Sequence[tuple[str, str, np.ndarray]], name: str) -> s
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f'<title>{html.escape(name)} - p2gs diagnosis</title>\n<link rel="icon" href="data:,">\n<style>\n{css}'
-        "td:last-child { white-space: normal; }\n</style>\n</head>\n<body>\n" + "\n".join(body) + "\n</body>\n</html>\n"
+        ".scroll { margin-bottom: 1rem; } td:last-child { white-space: normal; }\n</style>\n</head>\n<body>\n"
+        + "\n".join(body)
+        + "\n</body>\n</html>\n"
     )
 
 
@@ -154,6 +156,8 @@ def _finish(d: dict) -> list[str]:
     if ways:
         rows = [[k.replace("_", " "), _number(w["before"]), _number(w["after"])] for k, w in ways]
         out.append(table(["image loss", "before the polish", "after"], rows))
+    rows = [[k.replace("_", " "), _number(r["static"]), _share(r["bright_static"])] for k, r in d["residuals"].items()]
+    out.append(table(["moved into the other state", "residual of the static part", "of the object wrong though static"], rows))
     polish = {j["part"]: j for j in p["joints"]}
     rows = []
     for j in d["joints"]:

@@ -16,7 +16,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.finish import FinishRecord
 from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
-from p2gs.models.joint_confidence import measure_joints, measuring_level, state_depth
+from p2gs.models.joint_confidence import CrossViews, measure_joints, measuring_level, state_depth
 from p2gs.models.single_state import render_gaussians
 from p2gs.ops import se3
 from p2gs.types import ArticulatedObject, GaussianTensors
@@ -65,6 +65,7 @@ def diagnose(
         "fusion": fusion(canonical, learned.canonical_time),
         "articulation": articulation(states, motions, canonical, learned, views, unit, render),
         "polish": polishing(record, twin, states, unit),
+        "residuals": residuals(states, record, views, render),
         "joints": [],
         "finish": {"parts": len(twin.parts), "notes": list(stages.notes)},
     }
@@ -75,6 +76,17 @@ def diagnose(
     for row, slot, earlier in zip(d["joints"], record.slots, trace(states, motions, record, views, **render), strict=True):
         row |= {"slot": slot, "confidence_by_stage": {**earlier, "finish": row["confidence"]}}
     return plain(d)
+
+
+def residuals(states, record: FinishRecord, views, render: dict) -> dict:
+    """Each state's Gaussians in the other state's photographs: mean residual of the static part, and the share of the object's pixels where
+    it is plainly wrong. What only one state shows (a cupboard's inside) is wrong one way; a moving piece that was left static both ways."""
+    level, out = min(measuring_level(views[s]) for s in (0, 1)), {}
+    for s, name in enumerate(("start_to_end", "end_to_start")):
+        T = record.after if s == 0 else se3.inverse(record.after)
+        seen = CrossViews(states[s], record.labels[s], T, views[1 - s], level=level, **render)
+        out[name] = {"static": seen.static_error, "bright_static": seen.bright_static}
+    return out
 
 
 def trace(states, motions, record: FinishRecord, views, **render) -> list[dict[str, float]]:

@@ -20,6 +20,7 @@ from p2gs.ops import se3
 from p2gs.types import Camera
 
 STEP = 0.02  # displacement of a part by a change of its joint, internal units (the object's diagonal is 2): one per cent
+BRIGHT = 0.15  # |render - photo| that one sees
 ON_SURFACE = 0.02  # tolerance along the ray of the free-space test, internal units
 DOUBT = {"residual": 4.0, "rise": 0.01, "fall": 0.04, "disagreement": 0.02}  # where a factor of the confidence is one half
 
@@ -130,6 +131,9 @@ class CrossViews:
 
     labels [N]: part of each Gaussian, 0 static.  transforms [K-1, 4, 4] carry this state to the photographs'.  Photographs: ``looks``
     of them at size ``level``, spread over ``views``; each part is measured on the ``count`` that show most of it.
+
+    static_error: mean |render - photo| where the static part shows.  bright_static: share of the object's pixels where the static
+    part shows and is off by more than ``BRIGHT``.
     """
 
     def __init__(
@@ -156,6 +160,8 @@ class CrossViews:
         still = [(s[..., 0] > 0.5) & ~n[1:].any(0) for s, n in zip(self.shares, near, strict=True)]
         total = sum(int(m.sum()) for m in still)
         self.static_error = sum(float(e[m].sum()) for e, m in zip(self.errors, still, strict=True)) / max(total, 1)
+        bright = sum(int((e[m] > BRIGHT).sum()) for e, m in zip(self.errors, still, strict=True))
+        self.bright_static = bright / max(sum(int((shot.alpha > 0.5).sum()) for shot in self.shots), 1)
 
     def draw(self, transforms: Tensor, camera: Camera, features: bool = False) -> tuple[Tensor, Tensor | None]:
         """Colour [H, W, 3] and, if asked for, how much of each pixel each part covers [H, W, K]."""

@@ -8,6 +8,7 @@ LIMITS = {
     "fog": (0.7, "share of half-transparent Gaussians above which surfaces are not surfaces"),
     "moved": (30, "surface points that moved, both states together; with fewer there is nothing to find"),
     "moved_without_part": (0.25, "share of the moved surface that no part took: a part may be missing"),
+    "bright_static": (0.1, "share of the object that is plainly wrong in both directions though nothing is said to move there"),
     "close_call": (0.01, "relative difference of image loss below which two explanations cannot be told apart"),
     "ambiguous": (0.4, "share of a part's Gaussians with unclear labels"),
     "matched": (0.05, "share of a part's fused Gaussians with a partner in the other state"),
@@ -37,6 +38,7 @@ def verdicts(d: dict, diagonal: float) -> list[dict]:
 
     _reconstruction(d, say)
     _discovery(d, say)
+    _static(d, say)
     _fusion(d, say)
     _articulation(d, say)
     _joints(d, say, diagonal)
@@ -101,6 +103,13 @@ def _discovery(d: dict, say) -> None:
         for k, share in enumerate(s["ambiguous_by_part"]):
             if k and share > limit("ambiguous"):
                 say("discovery", f"Part {k}: {share:.0%} of its Gaussians in the {name} state have unclear labels.", "note")
+
+
+def _static(d: dict, say) -> None:
+    wrong = min(r["bright_static"] for r in d["residuals"].values())
+    if wrong > limit("bright_static"):
+        text = f"{wrong:.0%} of the object is wrong both ways where nothing is said to move: a moving piece was left with the base."
+        say("discovery", text)
 
 
 def _fusion(d: dict, say) -> None:

@@ -1,0 +1,129 @@
+"""A joint's confidence falls with its error, with lost support and with two directions that disagree; it needs no ground truth."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny import hinge, photographs, slide, textured_panels
+
+from p2gs.data.views import TrainingViews
+from p2gs.models.handover import StateGaussians
+from p2gs.models.joint_confidence import JointEvidence, landing, measure_joints, measuring_level, nudges, state_depth
+from p2gs.models.screw_polish import MovedGaussians
+from p2gs.ops import se3, so3
+from p2gs.types import GaussianTensors
+
+SIZE = 64
+
+
+def world(transform):
+    """Two states of the panels that are exactly right, their photographs and rendered depth."""
+    g, labels = textured_panels(1600)
+    g.log_scales.fill_(-3.5)
+    means, quats, sh = MovedGaussians(g, labels).moved(transform[None])
+    states = [StateGaussians(0, g), StateGaussians(1, GaussianTensors(means, quats, g.log_scales, g.opacity_logits, sh))]
+    views = {s: TrainingViews(photographs(g, labels, T, s, SIZE), [SIZE]) for s, T in ((0, torch.eye(4).double()), (1, transform))}
+    return states, labels, views
+
+
+def evidence(states, labels, views, T, kind, both=None) -> JointEvidence:
+    stacks = [state_depth(state, views[s], SIZE) for s, state in enumerate(states)]
+    (found,) = measure_joints(states, [labels, labels], T[None], [kind], views, stacks, level=SIZE, both=both)
+    return found
+
+
+def turned(T, degrees, tilt=False):
+    """A hinge's motion with ``degrees`` more, or with its axis tilted by them."""
+    s = se3.screw_parameters(T)
+    axis = s.axis
+    if tilt:
+        across = torch.linalg.cross(axis, torch.tensor([0.0, 1, 0]).double())
+        axis = so3.rotvec_to_matrix(across / across.norm() * degrees / 57.29578) @ axis
+    return se3.from_screw(axis, s.origin, s.angle + (0.0 if tilt else degrees / 57.29578))
+
+
+@pytest.fixture(scope="module")
+def door():
+    return world(hinge())
+
+
+@pytest.mark.parametrize("tilt", [False, True])
+def test_confidence_of_a_hinge_falls_with_its_error(door, tilt):
+    found = [evidence(*door, turned(hinge(), d, tilt), "revolute") for d in (0.0, 1.0, 2.5, 5.0, 10.0)]
+    values = [e.confidence for e in found]
+    assert values[0] > 0.8 and values[3] < 0.4 and values[4] < 0.1, values
+    values = [max(v, 0.01) for v in values]  # far from the right motion there is nothing left to order
+    assert values == sorted(values, reverse=True), values
+    assert found[0].fall < 0.02 < found[3].fall
+
+
+def test_confidence_of_a_slide_falls_with_its_error():
+    states, labels, views = world(slide())
+    values = []
+    for miss in (0.0, 0.02, 0.05, 0.1):
+        T = slide()
+        T[0, 3] += miss
+        values.append(evidence(states, labels, views, T, "prismatic").confidence)
+    assert values[0] > 0.8 and values[2] < 0.4 and values == sorted(values, reverse=True), values
+
+
+def test_half_the_support_removed(door):
+    """Where the other state shows only half of the part, half of it lands in free space."""
+    states, labels, views = door
+    moved = (labels == 1) & (states[0].gaussians.means[:, 2] > 0)
+    rest = StateGaussians(1, states[1].gaussians[~moved])
+    g, kept = states[0].gaussians[~moved], labels[~moved]
+    half = {0: views[0], 1: TrainingViews(photographs(g, kept, hinge(), 1, SIZE), [SIZE])}
+    stacks = [state_depth(s, half[i], SIZE) for i, s in enumerate((states[0], rest))]
+    (found,) = measure_joints([states[0], rest], [labels, kept], hinge()[None], ["revolute"], half, stacks, level=SIZE)
+    whole = evidence(*door, hinge(), "revolute")
+    assert 0.3 < found.contradicted < 0.7 and whole.contradicted < 0.05
+    assert found.confidence < 0.6 * whole.confidence
+
+
+def test_directions_that_disagree(door):
+    values = []
+    for degrees in (0.0, 1.0, 3.0):
+        both = [hinge()[None], turned(hinge(), degrees)[None]]
+        values.append(evidence(*door, hinge(), "revolute", both).confidence)
+    assert values[0] > values[1] > values[2] and values[2] < 0.7 * values[0], values
+
+
+def test_landing_tells_surface_from_free_space(door):
+    states, labels, views = door
+    stack = state_depth(states[1], views[1], SIZE)
+    (right,) = landing(states[0], labels, hinge()[None], stack)
+    (stayed,) = landing(states[0], labels, torch.eye(4).double()[None], stack)
+    assert right[0] > 0.6 and right[1] < 0.05  # the rest is inside the panel, behind its face
+    assert stayed[1] > 0.3
+    assert landing(states[0], torch.zeros_like(labels), hinge()[None], stack) == [(0.0, 0.0)]
+
+
+def test_nudges_keep_the_joint_type_and_the_size():
+    centre = torch.tensor([0.0, 0.5, 0.0]).double()
+    for kind, T, count in (("revolute", hinge(), 5), ("prismatic", slide(), 3)):
+        pairs = nudges(kind, T, centre, 0.3, 0.02)
+        assert len(pairs) == count
+        for forth, back in pairs:
+            for changed in (forth, back):
+                s = se3.screw_parameters(changed)
+                assert float(s.translation.abs() if kind == "revolute" else so3.rotation_angle(changed[:3, :3])) < 1e-6
+                assert 0 < float((changed - T).abs().max()) < 0.2
+
+
+def test_a_part_that_no_photograph_shows_has_no_confidence(door):
+    states, labels, views = door
+    far = torch.eye(4).double()
+    far[2, 3] = 50.0
+    found = evidence(states, labels, views, far, "prismatic")
+    assert found.views == 0 and found.confidence == 0.0
+
+
+def test_factors():
+    clean = JointEvidence(coverage=0.5, contradicted=0.0, residual=0.9, rise=1.0, fall=0.0, disagreement=0.0, views=4)
+    assert clean.confidence == pytest.approx(1.0, abs=1e-3)
+    half = {"coverage": 0.25, "contradicted": 0.5, "residual": 5.0, "rise": 0.01, "fall": 0.04, "disagreement": 0.02}
+    for name, worse in half.items():
+        changed = replace(clean, **{name: worse})
+        assert changed.confidence == pytest.approx(0.5, abs=0.01), name
+    assert measuring_level(TrainingViews([], [100, 400])) == 100 and measuring_level(TrainingViews([], [300])) == 300
