@@ -12,6 +12,7 @@ from p2gs.export.convex import Piece, decompose, intersect
 from p2gs.export.mesh import read_meshes, write_meshes
 from p2gs.export.tsdf import Mesh, vertex_normals
 from p2gs.export.twin_json import load_twin
+from p2gs.models.joint_range import extend_ranges
 from p2gs.types import Joint, UserError
 
 DENSITY = 300.0  # kg / m^3 of the convex pieces: chipboard furniture with some air in it
@@ -100,12 +101,14 @@ def load_asset(
     density: float = DENSITY,
     max_faces: int = MAX_FACES,
     solid: bool = True,
+    extend_range: bool = False,
 ) -> Asset:
     """Read a run (its meshes are made if they are not there) into the target's conventions.
 
     scale: metres per input unit.  up: axis of the target that points up; the input's is z.  origin: ``keep`` the input's,
     ``center`` of the object's box, or the middle of its ``bottom``.  solid: with collision pieces and inertia; without, for looking
-    at only, it takes no time.  Raises UserError for other values or a run without a twin.
+    at only, it takes no time.  extend_range: joint limits beyond the observed motion, until parts touch.  Raises UserError for other
+    values or a run without a twin.
     """
     if up not in UPS:
         raise UserError(f"--up is '{up}', expected one of {', '.join(UPS)}")
@@ -115,6 +118,8 @@ def load_asset(
         raise UserError(f"--scale is {scale:g}, but metres per input unit must be positive")
     run_dir = Path(run_dir)
     obj = load_twin(run_dir)
+    if extend_range:
+        obj.parts = extend_ranges(obj)
     meshes = read_meshes(run_dir)
     if meshes is None:
         write_meshes(run_dir)

@@ -79,10 +79,12 @@ def export_run(
     scale: float = 1.0,
     up: Optional[str] = None,
     origin: str = "keep",
+    extend_range: bool = False,
 ) -> list[Path]:
     """Write a finished run in the named formats (``all``: every one) into ``out`` (default the run's folder); returns the files.
 
     scale: metres per input unit.  up: z, y or x, by default what the format expects.  origin: keep, center or bottom.
+    extend_range: joint limits go on beyond the observed motion until parts touch (twin.json keeps what was observed).
     Raises UserError for an unknown format, with the nearest name.
     """
     names = list(dict.fromkeys(n for f in formats for n in (EXPORTERS if f == "all" else [f])))
@@ -96,6 +98,6 @@ def export_run(
     for name, write in writers.items():
         axis = up or DEFAULT_UP.get(name, "z")
         if axis not in assets:
-            assets[axis] = load_asset(run_dir, scale, axis, origin)
+            assets[axis] = load_asset(run_dir, scale, axis, origin, extend_range=extend_range)
         written.append(write(assets[axis], out))
     return written

@@ -11,6 +11,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.joint_confidence import JointEvidence, measure_joints, measuring_level, state_depth
+from p2gs.models.joint_range import extend_ranges
 from p2gs.models.part_motions import refine
 from p2gs.models.phase import PHASES
 from p2gs.models.screw_polish import PolishConfig, photometric_cost
@@ -27,7 +28,8 @@ class FinishConfig:
     solid Gaussians vanishes.  min_motion: likewise one that moves its points by less (internal units).  prismatic_below: a free motion
     (paper's start) that turns by less than this many degrees is a slide.  clean_neighbours: labels are the majority among this many
     neighbours at canonical time (0 = as learned).  exports: simulator formats written at the end of a fit, with meshes and report (empty:
-    neither; `p2gs export` makes them later).
+    neither; `p2gs export` makes them later).  extend_range: joint limits go on beyond the observed motion until the part touches another
+    one (half a turn, the object's diagonal at most); off: they are the observed motion.
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.8))
@@ -36,6 +38,7 @@ class FinishConfig:
     prismatic_below: float = 5.0
     clean_neighbours: int = 8
     exports: list[str] = field(default_factory=lambda: ["urdf", "mjcf", "glb"])
+    extend_range: bool = False
 
 
 @dataclass
@@ -174,7 +177,10 @@ def finish(
         centre = learned.gaussians.means[rows].double().mean(0)
         joint = make_joint(kind, transforms[k], se3.apply(se3.screw_at(transforms[k], -time), centre[None])[0])
         parts.append(Part(k + 1, joint, int(rows.sum()), record.evidence[k].confidence))
-    return ArticulatedObject(learned.gaussians, labels, parts, time, similarity), notes, record
+    twin = ArticulatedObject(learned.gaussians, labels, parts, time, similarity)
+    if config.extend_range:
+        twin.parts = extend_ranges(twin)
+    return twin, notes, record
 
 
 def measure(

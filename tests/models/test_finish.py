@@ -1,5 +1,7 @@
 """Labels, slots and joints at the end; parts that are one become one."""
 
+from dataclasses import replace
+
 import torch
 from tiny import hinge, photographs, slide, textured_panels
 
@@ -79,3 +81,6 @@ def test_empty_and_unmoving_slots_vanish_with_a_word():
     twin, notes, _ = finish(learned, states, views, config, Similarity(), seed=0, backend="auto")
     assert len(twin.parts) == 2 and len(notes) == 2 and "slot 2 of 3 vanished" in notes[0]
     assert twin.parts[1].joint.type == "prismatic" and int(twin.part_ids.max()) == 1
+    seen = twin.parts[1].joint.limits
+    further = finish(learned, states, views, replace(config, extend_range=True), Similarity(), seed=0, backend="auto")[0].parts[1].joint
+    assert seen == (0.0, further.motion) and further.limits[0] <= 0.0 and further.limits[1] > seen[1]
