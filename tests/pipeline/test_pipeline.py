@@ -66,7 +66,7 @@ def test_result_folder(folder):
         assert joint["type"] in ("revolute", "prismatic") and len(joint["axis"]) == 3
         assert abs(sum(a * a for a in joint["axis"]) - 1) < 1e-6
         assert joint["limits"][0] <= joint["limits"][1] and 0 <= part["confidence"] <= 1
-    for name in ("config.yaml", "splats/canonical.ply", "splats/start.ply", "splats/end.ply", "logs/stages.json"):
+    for name in ("config.yaml", "splats/canonical.ply", "splats/start.ply", "splats/end.ply", "logs/stages.json", "diagnostics.html"):
         assert (run / name).exists(), name
     assert list((run / "media").glob("*.png")) and list((run / "logs").rglob("events*"))
 
@@ -97,6 +97,7 @@ def test_kill_and_go_on_gives_the_same_twin(folder, stage, tmp_path):
         assert torch.equal(a.gaussians.means, b.gaussians.means), name
     assert (run / "twin.json").read_bytes() == (folder / "whole" / "twin.json").read_bytes()
     assert (run / "splats/canonical.ply").read_bytes() == (folder / "whole" / "splats/canonical.ply").read_bytes()
+    assert json.loads((run / "diagnostics.json").read_text()) == json.loads((folder / "whole" / "diagnostics.json").read_text())
 
 
 def test_everything_that_can_be_null(folder, tmp_path):
