@@ -39,8 +39,46 @@ void reserve(T*& data, size_t& capacity, size_t wanted) {
     capacity = grown;
 }
 
+// One pass of the sort over piece k of the input: counted first, then put where the counts of all pieces say.
+struct SortPass {
+    const RasterFrame& f;
+    const uint64_t* from;  // null: the keys and ids of the chunks
+    uint64_t* to;
+    uint32_t *counts, count, low, mask;  // counts [pieces][mask + 1]
+    int pieces, shift, digit, passes;    // passes: counted in one go, their counts behind each other (a single piece stays the same set)
+
+    template <class Each>
+    void walk(int k, Each&& each) const {
+        if (from) {
+            const uint32_t end = uint32_t(uint64_t(count) * (k + 1) / pieces);
+            for (uint32_t i = uint32_t(uint64_t(count) * k / pieces); i < end; ++i) each(from[i]);
+            return;
+        }
+        for (int c = f.chunks * k / pieces; c < f.chunks * (k + 1) / pieces; ++c) {
+            const uint32_t *keys = f.keys + size_t(c) * kChunk, *ids = f.ids + size_t(c) * kChunk;
+            for (uint32_t i = 0; i < f.visible[c]; ++i) each(uint64_t(keys[i] - low) << 32 | ids[i]);
+        }
+    }
+    uint32_t* counts_of(int k) const { return counts + size_t(k) * (mask + 1); }
+};
+
+void count_piece(int k, int, void* p) {
+    const SortPass& s = *static_cast<const SortPass*>(p);
+    uint32_t* counts = s.counts_of(k);
+    std::memset(counts, 0, sizeof(uint32_t) * (s.mask + 1) * size_t(s.passes));
+    s.walk(k, [&](uint64_t item) {
+        for (int p = 0; p < s.passes; ++p) ++counts[p * size_t(s.mask + 1) + (item >> (s.shift + p * s.digit) & s.mask)];
+    });
+}
+
+void place_piece(int k, int, void* p) {
+    const SortPass& s = *static_cast<const SortPass*>(p);
+    uint32_t* at = s.counts_of(k);
+    s.walk(k, [&](uint64_t item) { s.to[at[item >> s.shift & s.mask]++] = item; });
+}
+
 // Visible Gaussians by the bits of their depth, near to far, equal depths in the order given. Returns their number; ids in the low halves of s.a.
-uint32_t sort_by_depth(const RasterFrame& f, SortBuffers& s) {
+uint32_t sort_by_depth(const RasterFrame& f, SortBuffers& s, int pieces) {
     uint32_t low = ~0u, high = 0, count = 0;
     for (int c = 0; c < f.chunks; ++c) {
         const uint32_t* keys = f.keys + size_t(c) * kChunk;
@@ -55,57 +93,77 @@ uint32_t sort_by_depth(const RasterFrame& f, SortBuffers& s) {
     reserve(s.b, s.b_size, count);
     int bits = 1;
     while (bits < 32 && (high - low) >> bits) ++bits;
-    const int passes = (bits + 11) / 12, digit = (bits + passes - 1) / passes, buckets = 1 << digit;
-    const uint32_t digit_mask = uint32_t(buckets - 1);
-    reserve(s.counts, s.counts_size, size_t(passes) << digit);
-    std::memset(s.counts, 0, sizeof(uint32_t) * (size_t(passes) << digit));
-    for (int c = 0; c < f.chunks; ++c) {
-        const uint32_t* keys = f.keys + size_t(c) * kChunk;
-        for (uint32_t i = 0; i < f.visible[c]; ++i)
-            for (int p = 0; p < passes; ++p) ++s.counts[(size_t(p) << digit) + (((keys[i] - low) >> (p * digit)) & digit_mask)];
-    }
+    const int passes = (bits + 11) / 12, digit = (bits + passes - 1) / passes;
+    const uint32_t buckets = 1u << digit;
+    reserve(s.counts, s.counts_size, size_t(std::max(pieces, passes)) << digit);
     for (int p = 0; p < passes; ++p) {
-        uint32_t at = 0, *counts = s.counts + (size_t(p) << digit);
-        for (int b = 0; b < buckets; ++b) {
-            uint32_t n = counts[b];
-            counts[b] = at;
-            at += n;
+        const bool alone = pieces == 1;
+        SortPass pass{f, p ? s.a : nullptr, p ? s.b : s.a, s.counts + (alone ? size_t(p) << digit : 0), count, low, buckets - 1, pieces,
+                      32 + p * digit, digit, alone ? passes : 1};
+        if (!p || !alone) parallel_for(pieces, pieces, count_piece, &pass);
+        uint32_t at = 0;
+        for (uint32_t b = 0; b < buckets; ++b)
+            for (int k = 0; k < pieces; ++k) {
+                uint32_t& n = pass.counts_of(k)[b];
+                const uint32_t begin = at;
+                at += n;
+                n = begin;
+            }
+        parallel_for(pieces, pieces, place_piece, &pass);
+        if (p) {
+            std::swap(s.a, s.b);
+            std::swap(s.a_size, s.b_size);
         }
-    }
-    for (int c = 0; c < f.chunks; ++c) {
-        const uint32_t *keys = f.keys + size_t(c) * kChunk, *ids = f.ids + size_t(c) * kChunk;
-        for (uint32_t i = 0; i < f.visible[c]; ++i) {
-            uint32_t key = keys[i] - low;
-            s.a[s.counts[key & digit_mask]++] = uint64_t(key) << 32 | ids[i];
-        }
-    }
-    for (int p = 1; p < passes; ++p) {
-        uint32_t* counts = s.counts + (size_t(p) << digit);
-        const int shift = 32 + p * digit;
-        for (uint32_t i = 0; i < count; ++i) s.b[counts[(s.a[i] >> shift) & digit_mask]++] = s.a[i];
-        std::swap(s.a, s.b);
-        std::swap(s.a_size, s.b_size);
     }
     return count;
 }
 
-// The pairs of all Gaussians, in depth order, into the lists of their tiles.
-void scatter(RasterFrame& f, const uint64_t* order, uint32_t count, uint32_t* cursor) {
+// The pairs of all Gaussians, in depth order, into the lists of their tiles. Each piece walks all of them and keeps those of its own tiles;
+// the others go to a place that nobody reads (no branch: which tile comes next cannot be foretold).
+struct Scatter {
+    RasterFrame& f;
+    const uint64_t* order;
+    uint32_t count, *cursors, *inside, tiles;  // of each piece: where a tile's next entry goes, and whether it is its own (1 or 0)
+};
+
+template <bool kAlone>
+void scatter_piece(int k, int, void* p) {
+    const Scatter& s = *static_cast<const Scatter*>(p);
+    const RasterFrame& f = s.f;
+    uint32_t *cursor = s.cursors + size_t(k) * s.tiles, *own = s.inside + size_t(k) * s.tiles;
     const uint32_t ahead = 8;
-    for (uint32_t i = 0; i < count; ++i) {
-        if (i + 2 * ahead < count) {
-            uint32_t next = uint32_t(order[i + 2 * ahead]);
+    for (uint32_t i = 0; i < s.count; ++i) {
+        if (i + 2 * ahead < s.count) {
+            uint32_t next = uint32_t(s.order[i + 2 * ahead]);
             __builtin_prefetch(&f.pair_range[next]);
         }
-        if (i + ahead < count) {
-            uint32_t next = uint32_t(order[i + ahead]);
+        if (i + ahead < s.count) {
+            uint32_t next = uint32_t(s.order[i + ahead]);
             __builtin_prefetch(f.pairs[next / kChunk].data + f.pair_range[next].begin);
         }
-        const uint32_t g = uint32_t(order[i]), chunk = g / kChunk, begin = f.pair_range[g].begin, stop = f.pair_range[g].count;
+        const uint32_t g = uint32_t(s.order[i]), chunk = g / kChunk, begin = f.pair_range[g].begin, stop = f.pair_range[g].count;
         const RasterPair* pairs = f.pairs[chunk].data + begin;
         const uint32_t slot = f.chunk_slot[chunk] + begin;
-        for (uint32_t k = 0; k < stop; ++k) f.entries[cursor[pairs[k].tile]++] = {pairs[k].mask, g, slot + k};
+        for (uint32_t j = 0; j < stop; ++j) {
+            const uint32_t tile = pairs[j].tile;
+            f.entries[cursor[tile]] = {pairs[j].mask, g, slot + j};
+            cursor[tile] += kAlone ? 1 : own[tile];
+        }
     }
+}
+
+// `memory`: 2 x pieces x tiles. The entries have 4 x pieces places more than there are pairs.
+void scatter(RasterFrame& f, const uint64_t* order, uint32_t count, uint32_t* memory, uint32_t tiles, int pieces) {
+    const uint32_t total = f.tile_begin[tiles];
+    Scatter s{f, order, count, memory, memory + size_t(pieces) * tiles, tiles};
+    for (int k = 0; k < pieces; ++k)
+        for (uint32_t t = 0; t < tiles; ++t) {
+            // a tile belongs to the piece in whose share of all pairs its first one lies
+            const bool mine = !total || int(uint64_t(std::min(f.tile_begin[t], total - 1)) * pieces / total) == k;
+            s.inside[size_t(k) * tiles + t] = mine;
+            s.cursors[size_t(k) * tiles + t] = mine ? f.tile_begin[t] : total + 4 * k;
+        }
+    parallel_for(pieces, pieces, pieces == 1 ? scatter_piece<true> : scatter_piece<false>, &s);
 }
 
 }  // namespace
@@ -134,7 +192,9 @@ void Frame::forward(const RasterArgs& a, bool keep, int threads) {
     reserve(tile_begin, tile_begin_size, tiles + 1);
     reserve(tile_end, tile_end_size, tiles);
     reserve(tile_blocks, tile_blocks_size, tiles);
-    reserve(tile_counts, tile_counts_size, tiles * size_t(threads));
+    // sorting and scattering: a small view is not worth the waking, and beyond a few pieces the walking that each does outweighs its share
+    const int pieces = a.n >= 8192 ? std::min(threads, 4) : 1;
+    reserve(tile_counts, tile_counts_size, tiles * size_t(std::max(threads, 2 * pieces)));
     if (size_t(chunks) > pairs_size) {
         size_t grown = size_t(chunks) + 8;
         void* p = std::realloc(pairs, grown * sizeof(RasterPairs));
@@ -165,16 +225,15 @@ void Frame::forward(const RasterArgs& a, bool keep, int threads) {
     }
     if (total > 0xffffffffu) throw std::bad_alloc();
     chunk_slot[chunks] = uint32_t(total);
-    reserve(entries, entries_size, size_t(total));
+    reserve(entries, entries_size, size_t(total) + 4 * size_t(pieces));
     uint32_t at = 0;
     for (size_t t = 0; t < tiles; ++t) {
         tile_begin[t] = at;
         for (int k = 0; k < threads; ++k) at += tile_counts[size_t(k) * tiles + t];
     }
     tile_begin[tiles] = at;
-    std::memcpy(tile_counts, tile_begin, sizeof(uint32_t) * tiles);
-    const uint32_t count = sort_by_depth(*this, sort);
-    scatter(*this, sort.a, count, tile_counts);
+    const uint32_t count = sort_by_depth(*this, sort, pieces);
+    scatter(*this, sort.a, count, tile_counts, uint32_t(tiles), pieces);
 
     parallel_for(int(tiles), threads, [](int tile, int, void* p) {
         const Context& c = *static_cast<const Context*>(p);

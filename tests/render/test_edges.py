@@ -123,10 +123,12 @@ def test_wrong_degree_and_backend():
         w.render("gsplatt", torch.float32)
 
 
-def test_same_bits_for_any_number_of_threads(isa):
-    w = world(3000, 131, 97, features=3, background="image", scale=(0.02, 0.2), seed=15)
+@pytest.mark.parametrize("n, scale", [(3000, (0.02, 0.2)), (20000, (0.005, 0.03))])
+def test_same_bits_for_any_number_of_threads(isa, n, scale):
+    """Few Gaussians are sorted by one thread, many by several."""
+    w = world(n, 131, 97, features=3, background="image", scale=scale, seed=15)
     results = []
-    for count in (1, 2, 3):
+    for count in (1, 2, 3, 7):
         torch.set_num_threads(count)
         out, leaves = w.render("cpu", torch.float32, depth_sq=True, absgrad=True)
         gradients = backward(out, leaves)
