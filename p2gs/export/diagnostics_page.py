@@ -130,8 +130,12 @@ def _discovery(d: dict) -> list[str]:
         out.append(table(["explanation", "image loss", "", "parts; what was dropped or merged (image loss with it, without it)"], rows))
         rows = [[f"{p['part']}", p["type"], _amount(p), f"{p['confidence']:.2f}"] for p in found["parts"]]
         out.append(table(["part of discovery", "type", "start to end", "share explained"], rows))
-    rows = [[k, " + ".join(map(str, s["gaussians"])), f"{s['ambiguous']:.0%}"] for k, s in d["labels"].items()]
-    return [*out, table(["state", "solid Gaussians by part", "unclear labels"], rows)]
+    rows = [
+        [k, " + ".join(map(str, s["gaussians"])), _share(s["ambiguous"]), f"{s['moved']:,}", _share(s["moved_static"])]
+        for k, s in d["labels"].items()
+    ]
+    head = ["state, as labelled in the twin", "solid Gaussians by part", "unclear labels", "seen to have moved", "of them static"]
+    return [*out, table(head, rows)]
 
 
 def _fusion(d: dict) -> list[str]:

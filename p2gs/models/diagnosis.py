@@ -14,9 +14,10 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews
 from p2gs.models.canonical import carry, with_static
+from p2gs.models.discovery.evidence import DepthStack, classify
 from p2gs.models.finish import FinishRecord
 from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
-from p2gs.models.joint_confidence import CrossViews, measure_joints, measuring_level, state_depth
+from p2gs.models.joint_confidence import ON_SURFACE, CrossViews, measure_joints, measuring_level, state_depth
 from p2gs.models.single_state import render_gaussians
 from p2gs.ops import se3
 from p2gs.types import ArticulatedObject, GaussianTensors
@@ -56,16 +57,18 @@ def diagnose(
     unit = 1.0 / twin.similarity.scale
     render = {"backend": backend, "device": device}
     level = max(n for s in (0, 1) for n in views[s].levels)
+    coarse = min(measuring_level(views[s]) for s in (0, 1))
+    stacks = [state_depth(state, views[s], coarse, count=16, **render) for s, state in enumerate(states)]
     d = {
         "format": FORMAT,
         "single_state": {STATES[s.state]: reconstruction(s.gaussians, views[s.state], level, **render) for s in states},
         "motion_evidence": None if motions is None else motion_evidence(motions, states),
         "discovery": None if motions is None else discovery(motions, unit),
-        "labels": {STATES[s]: labelling(states[s], record, s, min_margin) for s in (0, 1)},
+        "labels": {STATES[s]: labelling(states[s], record, s, min_margin, stacks[1 - s]) for s in (0, 1)},
         "fusion": fusion(canonical, learned.canonical_time),
         "articulation": articulation(states, motions, canonical, learned, views, unit, render),
         "polish": polishing(record, twin, states, unit),
-        "residuals": residuals(states, record, views, render),
+        "residuals": residuals(states, record, views, coarse, render),
         "joints": [],
         "finish": {"parts": len(twin.parts), "notes": list(stages.notes)},
     }
@@ -73,15 +76,15 @@ def diagnose(
         row = {"part": part.id, "type": part.joint.type} | evidence.as_dict()
         row["disagreement"] *= unit
         d["joints"].append(row)
-    for row, slot, earlier in zip(d["joints"], record.slots, trace(states, motions, record, views, **render), strict=True):
+    for row, slot, earlier in zip(d["joints"], record.slots, trace(states, motions, record, views, stacks, coarse, render), strict=True):
         row |= {"slot": slot, "confidence_by_stage": {**earlier, "finish": row["confidence"]}}
     return plain(d)
 
 
-def residuals(states, record: FinishRecord, views, render: dict) -> dict:
+def residuals(states, record: FinishRecord, views, level: int, render: dict) -> dict:
     """Each state's Gaussians in the other state's photographs: mean residual of the static part, and the share of the object's pixels where
     it is plainly wrong. What only one state shows (a cupboard's inside) is wrong one way; a moving piece that was left static both ways."""
-    level, out = min(measuring_level(views[s]) for s in (0, 1)), {}
+    out = {}
     for s, name in enumerate(("start_to_end", "end_to_start")):
         T = record.after if s == 0 else se3.inverse(record.after)
         seen = CrossViews(states[s], record.labels[s], T, views[1 - s], level=level, **render)
@@ -89,14 +92,12 @@ def residuals(states, record: FinishRecord, views, render: dict) -> dict:
     return out
 
 
-def trace(states, motions, record: FinishRecord, views, **render) -> list[dict[str, float]]:
+def trace(states, motions, record: FinishRecord, views, stacks, level: int, render: dict) -> list[dict[str, float]]:
     """Per joint of the twin the confidence it would have had as discovery and as the articulation phase handed it over, on fewer
     photographs and without the two directions: where it falls, a stage lost the joint."""
     slots = [k - 1 for k in record.slots]
     if not slots:
         return []
-    level = min(measuring_level(views[s]) for s in (0, 1))
-    stacks = [state_depth(state, views[s], level, count=16, **render) for s, state in enumerate(states)]
     options = {"level": level, "looks": 8, "count": 3, **render}
     types = ["prismatic" if bool((T[:3, :3] == torch.eye(3)).all()) else "revolute" for T in record.before]
     out: list[dict[str, float]] = [{} for _ in slots]
@@ -173,14 +174,19 @@ def amount(kind: str, T: Tensor, unit: float) -> dict:
     return {"degrees": math.degrees(float(se3.screw_parameters(T.double()).angle))}
 
 
-def labelling(state: StateGaussians, record: FinishRecord, s: int, min_margin: float) -> dict:
-    """Gaussians by part, and the share of the solid ones whose label is too unclear for the polish."""
+def labelling(state: StateGaussians, record: FinishRecord, s: int, min_margin: float, other: DepthStack) -> dict:
+    """Gaussians by part, the share of the solid ones whose label is too unclear for the polish, and of those that ``other``, the other
+    state's rendered depth, says have moved (how many, and the share that is called static all the same)."""
     solid = torch.sigmoid(state.gaussians.opacity_logits) > 0.5
     labels, margin = record.labels[s][solid], record.margin[s][solid]
     count = torch.bincount(labels, minlength=len(record.after) + 1).tolist()
     unclear = margin < min_margin
     shares = [float(unclear[labels == k].float().mean()) if n else 0.0 for k, n in enumerate(count)]
-    return {"gaussians": count, "ambiguous": float(unclear.float().mean()) if len(margin) else 0.0, "ambiguous_by_part": shares}
+    free, on, _ = other.counts(state.gaussians.means[solid], ON_SURFACE)
+    moved = classify(free, on)[0]
+    left = float((labels[moved] == 0).float().mean()) if bool(moved.any()) else 0.0
+    unclear = float(unclear.float().mean()) if len(margin) else 0.0
+    return {"gaussians": count, "ambiguous": unclear, "ambiguous_by_part": shares, "moved": int(moved.sum()), "moved_static": left}
 
 
 def fusion(canonical: CanonicalGaussians, time: float) -> dict:

@@ -8,6 +8,7 @@ LIMITS = {
     "fog": (0.7, "share of half-transparent Gaussians above which surfaces are not surfaces"),
     "moved": (30, "surface points that moved, both states together; with fewer there is nothing to find"),
     "moved_without_part": (0.25, "share of the moved surface that no part took: a part may be missing"),
+    "moved_static": (0.25, "the same at the end, of the surface that the other state is seen to be empty at"),
     "bright_static": (0.1, "share of the object that is plainly wrong in both directions though nothing is said to move there"),
     "close_call": (0.01, "relative difference of image loss below which two explanations cannot be told apart"),
     "ambiguous": (0.4, "share of a part's Gaussians with unclear labels"),
@@ -106,6 +107,14 @@ def _discovery(d: dict, say) -> None:
 
 
 def _static(d: dict, say) -> None:
+    """What moved and is called static all the same: by free space, and by the images."""
+    for name, s in d["labels"].items():
+        if s["moved"] < limit("moved") or s["moved_static"] <= limit("moved_static"):
+            continue
+        known = (d["motion_evidence"] or {}).get(name, {}).get("moved_without_part")
+        if known is None or known <= limit("moved_without_part"):  # else discovery has said so
+            text = f"{s['moved_static']:.0%} of what moved in the {name} state is called static in the twin: a part is missing."
+            say("discovery" if known is None else "articulation", text)
     wrong = min(r["bright_static"] for r in d["residuals"].values())
     if wrong > limit("bright_static"):
         text = f"{wrong:.0%} of the object is wrong both ways where nothing is said to move: a moving piece was left with the base."

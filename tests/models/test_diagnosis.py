@@ -60,6 +60,8 @@ def test_a_right_run_has_no_warning(right):
     assert joint["confidence"] > 0.7 and set(joint["confidence_by_stage"]) == {"discovery", "articulation", "finish"}
     assert right["single_state"]["start"]["psnr"] > 30 and right["single_state"]["start"]["alpha_iou"] > 0.95
     assert right["fusion"]["matched"] == [300, 300] and right["fusion"]["dropped"] == 3
+    # the end's panel stands between the two, where few views of the start look: there is hardly evidence of it
+    assert right["labels"]["start"]["moved"] > 50 and all(s["moved_static"] < 0.1 for s in right["labels"].values())
     assert right["polish"]["joints"][0]["disagreement_degrees"] < 2
 
 
@@ -74,6 +76,17 @@ def test_a_wrong_motion_is_laid_at_the_stage_that_made_it():
     assert lost_at(verdicts(d, 1.0)) == "articulation"
 
 
+def test_a_part_that_the_twin_does_not_have_is_missed():
+    """All labels static at the end: free space says what moved."""
+    states, labels, views = two_states(hinge())
+    stages, _, _ = small_run()
+    nobody = replace(stages.learned, probs=torch.tensor([[1.0, 0.0]]).expand(len(labels), 2))
+    twin, notes, record = finish(nobody, states, views, FinishConfig(), Similarity(), seed=0, backend="auto")
+    d = diagnose(replace(stages, learned=nobody, record=record, notes=notes), twin, views, min_margin=0.1)
+    assert d["labels"]["start"]["moved_static"] == 1.0
+    assert any("called static in the twin" in v["text"] and v["stage"] == "articulation" for v in verdicts(d, 1.0))
+
+
 @pytest.mark.parametrize(
     ("stage", "change", "word"),
     [
@@ -82,6 +95,7 @@ def test_a_wrong_motion_is_laid_at_the_stage_that_made_it():
         ("single_state", lambda d: d["single_state"]["start"].update(fog=0.9), "half-transparent"),
         ("discovery", lambda d: [s.update(moved=4) for s in d["motion_evidence"].values()], "Next to nothing moved"),
         ("discovery", lambda d: d["motion_evidence"]["end"].update(moved_without_part=0.6), "belongs to no part"),
+        ("articulation", lambda d: d["labels"]["end"].update(moved=100, moved_static=0.5), "called static in the twin"),
         ("discovery", lambda d: d["discovery"].update(parts=[]), "no moving part"),
         ("discovery", lambda d: [r.update(bright_static=0.3) for r in d["residuals"].values()], "left with the base"),
         ("canonical_fusion", lambda d: d["fusion"].update(matched=[300, 2]), "have a partner"),
