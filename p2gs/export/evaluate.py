@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Optional
 import numpy as np
 
 from p2gs.export.mesh import read_meshes
-from p2gs.export.paint import draw
+from p2gs.export.paint import draw, rasterizer_of
 from p2gs.export.pose import pose
 from p2gs.export.twin_json import load_twin
 from p2gs.export.views import bounds
@@ -62,7 +62,8 @@ def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict
         metrics["joints"] = report.to_dict()
         chamfer = surface_scores(run_dir, truth, {s.gt: s.pred for s in report.joints if s.pred is not None}, missing)
         metrics |= {} if chamfer is None else {"chamfer": chamfer}
-    metrics["views"] = view_scores(obj, scene, missing)
+    with rasterizer_of(run_dir):
+        metrics["views"] = view_scores(obj, scene, missing)
     metrics["penetration"] = evaluate_penetration(obj)
     metrics["seconds"] = round(time.perf_counter() - began, 2)
     metrics["missing"] = missing

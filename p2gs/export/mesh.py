@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Optional, Sequence
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from p2gs.export.paint import draw
+from p2gs.export.paint import draw, rasterizer_of
 from p2gs.export.pose import part_transform, pose
 from p2gs.export.tsdf import DepthView, Mesh, add_normals, fuse, largest_components
 from p2gs.export.twin_json import load_twin
@@ -19,8 +20,12 @@ from p2gs.types import ArticulatedObject, Camera, GaussianTensors, UserError
 
 STATES = ("start", "end")
 RESOLUTION = 160  # voxels along the longest side of the object's box
-VIEWS = 40  # a state
+VIEWS = 64  # a state
 FEATURES = 16  # channels a rasterizer takes at once
+FIRM = 0.8  # opacity a ray must meet to count as a sighting of surface
+FOG = 2.5  # times the usual spread of depth along a ray: what is more is fog
+NEAR = 0.02  # of the object's longest side: see look and fog_limit
+EDGE, TRUNCATION, BEHIND = 2.0, 4.0, 2.0  # voxels: see tsdf.add_normals and tsdf.fuse
 
 
 def start_motion(obj: ArticulatedObject, part: int, t: float) -> Tensor:
@@ -28,20 +33,57 @@ def start_motion(obj: ArticulatedObject, part: int, t: float) -> Tensor:
     return part_transform(obj, part, t) @ torch.linalg.inv(part_transform(obj, part, 0.0))
 
 
-def label_image(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Depth, labels, colour and alpha of one view; a pixel's label is the part that covers most of it, -1 where little is hit.
+@dataclass
+class PartView:
+    """What a camera sees of a twin. depth [H, W] along z, 0 where little is hit.  label [H, W] int64: the part that covers most of a
+    pixel, -1 where little is hit.  colour [H, W, 3] in 0..1.  alpha [H, W].  spread [H, W]: standard deviation of depth along the ray."""
 
-    part_index [N] in 0..parts-1.  depth [H, W]: where the transmittance passes one half, 0 elsewhere.
+    depth: Tensor
+    label: Tensor
+    colour: Tensor
+    alpha: Tensor
+    spread: Tensor
+
+
+def look(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera, near: float) -> PartView:
+    """Draw the parts. part_index [N] in 0..parts-1.
+
+    near: where the mean depth of a ray lies within this of its median (where transmittance passes one half), the mean is taken: the
+    median jumps from Gaussian to Gaussian. Further apart, the ray meets two surfaces and the mean lies on neither.
     """
     onehot = torch.nn.functional.one_hot(part_index, parts).float()
-    out = draw(g, camera, 0.0, features=onehot[:, :FEATURES])
+    reference = float(g.means.mean(0) @ camera.viewmat[2, :3] + camera.viewmat[2, 3])
+    out = draw(g, camera, 0.0, features=onehot[:, :FEATURES], depth_sq=True, depth_ref=reference)
     more = onehot[:, FEATURES:].split(FEATURES, 1) if parts > FEATURES else ()
     shares = [out.features] + [draw(g, camera, 0.0, features=c).features for c in more]
-    label = torch.cat(shares, -1).argmax(-1)
-    solid = (out.alpha > 0.5) & (out.median_depth > 0)
-    colour = out.colour / out.alpha.clamp_min(1e-3)[..., None]
-    depth = torch.where(solid, out.median_depth, torch.zeros_like(out.median_depth))
-    return depth, torch.where(solid, label, torch.full_like(label, -1)), colour.clamp(0, 1), out.alpha
+    mean = out.expected_depth
+    median = mean if out.median_depth is None else out.median_depth  # gsplat gives none
+    solid = (out.alpha > 0.5) & (median > 0)
+    alpha = out.alpha.clamp_min(1e-3)
+    return PartView(
+        depth=torch.where(solid, torch.where((mean - median).abs() < near, mean, median), torch.zeros_like(mean)),
+        label=torch.where(solid, torch.cat(shares, -1).argmax(-1), torch.full_like(solid, -1, dtype=torch.int64)),
+        colour=(out.colour / alpha[..., None]).clamp(0, 1),
+        alpha=out.alpha,
+        spread=out.depth_variance.clamp_min(0).sqrt() / alpha,
+    )
+
+
+def fog_limit(looks: Sequence[PartView], size: float) -> float:
+    """Spread beyond which a ray has met fog: ``FOG`` times what is usual in this twin, as a coarse one is loose everywhere; at least a
+    fiftieth of its longest side ``size``."""
+    solid = [v.spread[v.alpha > FIRM] for v in looks]
+    spread = torch.cat(solid) if solid else torch.zeros(0)
+    return max(FOG * float(spread.median()) if len(spread) else 0.0, NEAR * size)
+
+
+def trust(seen: PartView, limit: float) -> Tensor:
+    """[H, W] in 0..1, how much a pixel's depth says of a surface. limit: see ``fog_limit``.
+
+    Fog covers a pixel poorly or is spread along its ray: no surface may come of it (it still hides nothing that others see before it).
+    """
+    firm = (seen.alpha > FIRM) & (seen.spread < limit)
+    return firm / (1 + (2 * seen.spread / limit) ** 2)
 
 
 def mesh_cameras(obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: int = VIEWS) -> list[tuple[int, Camera]]:
@@ -62,19 +104,23 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
     """
     lo, hi = bounds(obj, (0.0,))
-    voxel = float((hi - lo).max()) / resolution
+    size = float((hi - lo).max())
+    voxel = size / resolution
     index = torch.zeros(max(p.id for p in obj.parts) + 1, dtype=torch.int64)
     for k, part in enumerate(obj.parts):
         index[part.id] = k
     posed = [pose(obj, 0.0), pose(obj, 1.0)]
+    looks = [look(posed[state], index[obj.part_ids], len(obj.parts), camera, near=NEAR * size) for state, camera in cameras]
+    limit = fog_limit(looks, size)
     views = []
-    for state, camera in cameras:
-        depth, label, colour, _ = label_image(posed[state], index[obj.part_ids], len(obj.parts), camera)
-        views.append(add_normals(DepthView(camera, depth, label, colour), edge=2 * voxel))
+    for seen, (_, camera) in zip(looks, cameras, strict=True):
+        view = add_normals(DepthView(camera, seen.depth, seen.label, seen.colour), edge=EDGE * voxel)
+        view.cosine = view.cosine * trust(seen, limit)
+        views.append(view)
     meshes = []
     for k in range(len(obj.parts)):
         motion = [start_motion(obj, k, 0.0), start_motion(obj, k, 1.0)]
-        mesh = fuse(views, [motion[state] for state, _ in cameras], k, voxel, trunc=4 * voxel, behind=2 * voxel)
+        mesh = fuse(views, [motion[state] for state, _ in cameras], k, voxel, trunc=TRUNCATION * voxel, behind=BEHIND * voxel)
         meshes.append(largest_components(mesh))
     return meshes
 
@@ -87,7 +133,8 @@ def write_meshes(run_dir: Path | str, resolution: int = RESOLUTION, log=None) ->
     run_dir = Path(run_dir)
     began = time.perf_counter()
     obj = load_twin(run_dir)
-    meshes = part_meshes(obj, mesh_cameras(obj, read_cameras(run_dir / "cameras.json")), resolution)
+    with rasterizer_of(run_dir):
+        meshes = part_meshes(obj, mesh_cameras(obj, read_cameras(run_dir / "cameras.json")), resolution)
     if not any(len(m.faces) for m in meshes):
         raise UserError(f"{run_dir}: the twin shows no surface from any of its cameras, so there is nothing to mesh")
     written: dict[str, list[Path]] = {}

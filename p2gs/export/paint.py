@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import fields
+from pathlib import Path
+from typing import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -13,17 +17,53 @@ from p2gs.export.pose import part_transform
 from p2gs.ops.palette import part_colour, part_colours
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
 from p2gs.render import rasterize
-from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, RenderOutput
+from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, RenderOutput, UserError
+
+RASTERIZER: ContextVar[str] = ContextVar("rasterizer", default="auto")
+
+
+@contextmanager
+def rasterizer_of(run_dir: Path | str) -> Iterator[str]:
+    """Inside, ``draw`` uses the rasterizer that the run's config names, as training did; "auto" for a folder without a config."""
+    name = run_rasterizer(run_dir)
+    token = RASTERIZER.set(name)
+    try:
+        yield name
+    finally:
+        RASTERIZER.reset(token)
+
+
+def run_rasterizer(run_dir: Path | str) -> str:
+    """``rasterizer`` of RUN/config.yaml. Raises UserError where that file is no readable YAML."""
+    import yaml
+
+    path = Path(run_dir) / "config.yaml"
+    if not path.is_file():
+        return "auto"
+    try:
+        config = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as err:
+        raise UserError(f"{path} is not readable YAML: {err}") from err
+    return str((config or {}).get("rasterizer", "auto")) if isinstance(config, dict) else "auto"
 
 
 def draw(g: GaussianTensors, camera: Camera, background: float | Sequence[float] = 1.0, **options) -> RenderOutput:
-    """One view of Gaussians that are in the camera's coordinates; background a grey value or RGB. No gradients."""
-    colour = torch.as_tensor(background, dtype=torch.float32).expand(3).contiguous()
+    """One view of Gaussians that are in the camera's coordinates; background a grey value or RGB. No gradients; results on the CPU.
+
+    The rasterizer is that of ``rasterizer_of``, if inside one; gsplat gets the tensors on the GPU.
+    """
+    backend = RASTERIZER.get()
+    device = torch.device("cuda") if backend == "gsplat" and torch.cuda.is_available() else g.means.device
+    colour = torch.as_tensor(background, dtype=torch.float32, device=device).expand(3).contiguous()
+    if device != g.means.device:
+        g = g.to(device)
+        options = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in options.items()}
     with torch.no_grad():
-        return rasterize(
+        out = rasterize(
             g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh, camera.viewmat, camera.K,
-            camera.width, camera.height, background=colour, **options,
+            camera.width, camera.height, background=colour, backend=backend, **options,
         )  # fmt: skip
+    return RenderOutput(**{f.name: v.cpu() if isinstance(v := getattr(out, f.name), Tensor) else v for f in fields(out)})
 
 
 def to_image(colour: Tensor) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Sequence
 
 from p2gs.export.frame import gaussians_to_input, object_to_input
 from p2gs.export.media import scene_photos, write_media
+from p2gs.export.paint import rasterizer_of
 from p2gs.export.pose import pose
 from p2gs.export.splat_ply import write_splat_ply
 from p2gs.export.twin_json import write_twin_json
@@ -29,7 +30,8 @@ def write_twin(obj: ArticulatedObject, run_dir: Path | str, scene: TwoStateScene
     cameras = scene_cameras(scene)
     write_cameras(run_dir / "cameras.json", cameras)
     if media:
-        write_media(outer, run_dir / "media", [c.camera for c in cameras], scene_photos(scene, outer))
+        with rasterizer_of(run_dir):
+            write_media(outer, run_dir / "media", [c.camera for c in cameras], scene_photos(scene, outer))
     write_twin_json(obj, run_dir / "twin.json")
 
 

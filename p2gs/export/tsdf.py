@@ -18,7 +18,7 @@ from p2gs.types import Camera
 
 BLOCK = 4  # voxels; active space is kept in cubes of this side
 CHUNK = 1 << 16  # voxels
-FREE_WEIGHT = 0.3  # of a view that sees through a voxel, against 1 of a view that sees surface in it head-on
+FREE_WEIGHT = 0.3  # of a view that sees through a voxel, against 1 of a view that sees surface in it head-on and for sure
 
 
 @dataclass
@@ -33,7 +33,7 @@ class DepthView:
     labels: Tensor
     colour: Tensor
     normal_dot: Optional[Tensor] = None  # [H, W] |n . ray| for a ray of unit z; distance to the surface's plane per unit of depth
-    cosine: Optional[Tensor] = None  # [H, W] between ray and normal, 0 where the depth has an edge
+    cosine: Optional[Tensor] = None  # [H, W] weight of the sighting: between ray and normal, 0 where the depth has an edge
 
 
 @dataclass

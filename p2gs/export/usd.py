@@ -7,18 +7,20 @@ from pathlib import Path
 import numpy as np
 
 from p2gs.export.asset import Asset, Hinge, Link
+from p2gs.types import UserError
 
 
 def write_usd(asset: Asset, out: Path) -> Path:
-    """OUT/twin.usda, metres, up axis Y or Z as asked for."""
-    up = asset.up.upper() if asset.up != "x" else "X"
+    """OUT/twin.usda, metres, up axis Y or Z as asked for. Raises UserError for x, which USD does not know as an up axis."""
+    if asset.up == "x":
+        raise UserError("--up is 'x', but a USD stage stands on y or z: give --up y or --up z")
     lines = [
         "#usda 1.0",
         "(",
         '    defaultPrim = "twin"',
         "    metersPerUnit = 1",
         "    kilogramsPerUnit = 1",
-        f'    upAxis = "{up}"',
+        f'    upAxis = "{asset.up.upper()}"',
         ")",
         'def Xform "twin" (prepend apiSchemas = ["PhysicsArticulationRootAPI"])',
         "{",

@@ -1,4 +1,4 @@
-"""Turntable videos of the motion: MP4 (H.264 where imageio-ffmpeg is installed, else OpenCV's mp4v) and GIF."""
+"""Turntable videos of the motion: H.264 where imageio-ffmpeg is installed, else a GIF and all frames as PNG."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Iterator, Sequence
 
 import numpy as np
 
-from p2gs.types import ArticulatedObject, UserError
+from p2gs.types import ArticulatedObject
 
 FPS = 24
 
@@ -31,32 +31,26 @@ def turntable_frames(obj: ArticulatedObject, size: int = 512, seconds: float = 5
         yield np.concatenate([render_plain(obj, camera, t), render_parts(obj, camera, t)], axis=1)
 
 
-def write_mp4(path: Path, frames: Sequence[np.ndarray], fps: int = FPS) -> Path:
-    """Frames [H, W, 3] uint8 of even size."""
+def write_video(folder: Path, frames: Sequence[np.ndarray], fps: int = FPS) -> list[Path]:
+    """Frames [H, W, 3] uint8 of even size as ``motion.mp4``; without imageio-ffmpeg as ``motion.gif`` and ``frames/0000.png`` ..."""
     try:
         import imageio_ffmpeg
     except ImportError:
-        return _write_mp4v(path, frames, fps)
+        from p2gs.export.media import save_png
+
+        stills = folder / "frames"
+        stills.mkdir(parents=True, exist_ok=True)
+        for i, frame in enumerate(frames):
+            save_png(stills / f"{i:04d}.png", frame)
+        return [write_gif(folder / "motion.gif", frames, fps), stills]
     h, w = frames[0].shape[:2]
+    path = folder / "motion.mp4"
     writer = imageio_ffmpeg.write_frames(str(path), (w, h), fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2)
     writer.send(None)
     for frame in frames:
         writer.send(np.ascontiguousarray(frame))
     writer.close()
-    return path
-
-
-def _write_mp4v(path: Path, frames: Sequence[np.ndarray], fps: int) -> Path:
-    import cv2
-
-    h, w = frames[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, (w, h))
-    if not writer.isOpened():
-        raise UserError(f"cannot write {path}: OpenCV here has no MP4 encoder; install imageio-ffmpeg (pip install p2gs[video])")
-    for frame in frames:
-        writer.write(np.ascontiguousarray(frame[..., ::-1]))
-    writer.release()
-    return path
+    return [path]
 
 
 def write_gif(path: Path, frames: Sequence[np.ndarray], fps: int = FPS, width: int = 640) -> Path:

@@ -156,18 +156,69 @@ def test_render_states_writes_any_time(run, tmp_path):
         render_states(tmp_path, [0.0])
 
 
-def test_videos_can_be_opened(tmp_path):
-    import cv2
+def test_gifs_can_be_opened(tmp_path):
     from PIL import Image
 
-    from p2gs.export.video import write_gif, write_mp4
+    from p2gs.export.video import write_gif
 
     ramp = np.tile(np.linspace(0, 255, 64).astype(np.uint8)[None, :, None], (32, 1, 3))
     frames = [np.roll(ramp, 4 * i, axis=1) for i in range(8)]
-    video = cv2.VideoCapture(str(write_mp4(tmp_path / "a.mp4", frames)))
-    shapes = []
-    while (got := video.read())[0]:
-        shapes.append(got[1].shape)
-    assert shapes == [(32, 64, 3)] * 8
     gif = Image.open(write_gif(tmp_path / "a.gif", frames))
     assert gif.n_frames == 4 and gif.size == (64, 32)
+
+
+def test_h264_where_imageio_ffmpeg_is_there(tmp_path):
+    """Browsers and slides take H.264 with 4:2:0 chroma and nothing else."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed (pip install p2gs[video])")
+    from p2gs.export.video import write_video
+
+    ramp = np.tile(np.linspace(0, 255, 64).astype(np.uint8)[None, :, None], (32, 1, 3))
+    (path,) = write_video(tmp_path, [np.roll(ramp, 4 * i, axis=1) for i in range(24)])
+    reader = ffmpeg.read_frames(str(path), pix_fmt="rgb24")
+    about = next(reader)
+    frames = [np.frombuffer(f, np.uint8).reshape(32, 64, 3) for f in reader]
+    assert path.suffix == ".mp4" and about["codec"] == "h264" and about["pix_fmt"].startswith("yuv420p") and len(frames) == 24
+    assert np.abs(frames[5].astype(int) - np.roll(ramp, 20, axis=1)).mean() < 8
+
+
+def test_gif_and_frames_where_it_is_not(tmp_path, monkeypatch):
+    import sys
+
+    import cv2
+    from PIL import Image
+
+    from p2gs.export.video import write_video
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    frames = [np.full((32, 64, 3), 10 * i, np.uint8) for i in range(6)]
+    gif, folder = write_video(tmp_path, frames)
+    assert Image.open(gif).n_frames == 3
+    stored = [cv2.imread(str(p)) for p in sorted(folder.glob("*.png"))]
+    assert len(stored) == 6 and all((a == b).all() for a, b in zip(stored, frames, strict=True))
+
+
+def test_pictures_are_drawn_with_the_runs_rasterizer(run, tmp_path):
+    """A rasterizer of the user's own, named in the run's config, draws every picture of predict."""
+    import shutil
+
+    from p2gs.export.paint import RASTERIZER, rasterizer_of
+    from p2gs.render import RASTERIZERS, find_rasterizer
+
+    calls = []
+    if "counting" not in RASTERIZERS:
+
+        @RASTERIZERS.register("counting")
+        def counting(inputs):
+            calls.append(inputs.width)
+            return find_rasterizer("torch_ref")(inputs)
+
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    (folder / "config.yaml").write_text("rasterizer: counting\n")
+    render_states(folder, [0.5], size=24)
+    assert calls and RASTERIZER.get() == "auto"
+    with rasterizer_of(run) as name:  # no config there
+        assert name == "auto"
+    (folder / "config.yaml").write_text("rasterizer: nothing_of_that_name\n")
+    with pytest.raises(UserError, match="unknown rasterizer"):
+        render_states(folder, [0.5], size=24)

@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 from toy import look_at, ring, start_parts, toy_scene, toy_twin
 
 from p2gs.export.frame import object_to_input
-from p2gs.export.mesh import label_image, mesh_cameras, part_meshes, read_mesh, start_motion, write_mesh, write_meshes
+from p2gs.export.mesh import PartView, fog_limit, look, mesh_cameras, part_meshes, read_mesh, start_motion, trust, write_mesh, write_meshes
 from p2gs.export.paint import part_coloured
 from p2gs.export.pose import pose
 from p2gs.export.run_folder import write_twin
 from p2gs.export.tsdf import ActiveGrid, DepthView, Mesh, add_normals, camera_rays, fuse, largest_components
 from p2gs.export.views import scene_cameras
-from p2gs.types import UserError
+from p2gs.types import GaussianTensors, UserError
 
 EYE = torch.eye(4, dtype=torch.float64)
 RADIUS, VOXEL = 0.5, 0.04
@@ -130,14 +130,50 @@ def test_mesh_ply_opens_elsewhere(tmp_path):
 def test_labels_are_the_front_parts():
     twin = object_to_input(toy_twin())
     camera = look_at((0.1, -2.5, 0.3), (0, 0, 0), 96)
-    depth, label, colour, _ = label_image(twin.gaussians, twin.part_ids, 3, camera)
+    seen = look(twin.gaussians, twin.part_ids, 3, camera, 0.05)
+    depth, label = seen.depth, seen.label
     assert set(label.unique().tolist()) == {-1, 0, 1, 2}
     assert label[48, 30] == 1 and label[48, 62] == 2 and label[2, 2] == -1 and depth[2, 2] == 0
     assert abs(float(depth[48, 30]) - (2.5 - 0.45)) < 0.05
-    many = label_image(twin.gaussians, twin.part_ids * 9, 20, camera)[1]  # more parts than a rasterizer has channels
+    many = look(twin.gaussians, twin.part_ids * 9, 20, camera, 0.05).label  # more parts than a rasterizer has channels
     assert torch.equal(many, torch.where(label > 0, label * 9, label))
-    painted = label_image(part_coloured(twin.gaussians, twin.part_ids), twin.part_ids, 3, camera)[2]
+    painted = look(part_coloured(twin.gaussians, twin.part_ids), twin.part_ids, 3, camera, 0.05).colour
     assert painted[48, 30, 0] > painted[48, 30, 2] and painted[48, 62, 2] > painted[48, 62, 0]
+
+
+def sheet(z, opacity, n=41):
+    """Gaussians on a square of the plane at height z, flat and close enough to cover it."""
+    g = torch.linspace(-0.5, 0.5, n)
+    x, y = torch.meshgrid(g, g, indexing="ij")
+    means = torch.stack([x, y, torch.full_like(x, z)], -1).reshape(-1, 3)
+    count, step = len(means), float(g[1] - g[0])
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1)
+    scales = torch.tensor([step, step, 1e-3]).log().repeat(count, 1)
+    return GaussianTensors(means, quats, scales, torch.full((count,), float(opacity)).logit(), torch.zeros(count, 1, 3))
+
+
+def test_fog_is_no_surface_and_two_surfaces_have_no_mean():
+    """A firm sheet is trusted; one behind a thin veil is found at its own depth or the veil's, never between; fog is not trusted."""
+    camera = look_at((0.01, 0.0, 2.0), (0, 0, 0), 64)
+    middle = (slice(28, 36), slice(28, 36))
+
+    def seen(*layers):
+        g = GaussianTensors.cat(list(layers))
+        out = look(g, torch.zeros(len(g), dtype=torch.int64), 1, camera, near=0.02)
+        return out.depth[middle], trust(out, 0.02)[middle]
+
+    depth, sure = seen(sheet(0.0, 0.9))
+    assert (depth - 2.0).abs().max() < 0.01 and sure.min() > 0.9
+    depth, sure = seen(sheet(0.3, 0.02), sheet(0.0, 0.9))
+    assert torch.minimum((depth - 2.0).abs(), (depth - 1.7).abs()).max() < 0.02 and sure.max() == 0
+    depth, sure = seen(*(sheet(float(z), 0.03) for z in torch.linspace(0.3, 0, 12)))
+    assert sure.max() == 0
+
+
+def test_what_is_fog_is_told_by_what_is_usual():
+    tight, loose = (PartView(*(torch.ones(4, 4),) * 4, torch.full((4, 4), s)) for s in (0.001, 0.1))
+    assert fog_limit([tight, loose, tight], 1.0) == pytest.approx(0.02) and fog_limit([], 1.0) == pytest.approx(0.02)
+    assert fog_limit([loose, loose, tight], 1.0) == pytest.approx(0.25)
 
 
 @pytest.fixture(scope="module")
@@ -157,10 +193,10 @@ def test_cabinet_meshes_lie_on_its_panels(run):
             mesh = read_mesh(run / "meshes" / state / f"part_{k}.ply")
             truth = pose(twin, t).means[twin.part_ids == k].numpy()
             distance = cKDTree(truth).query(mesh.vertices)[0]
-            assert np.quantile(distance, 0.95) < 0.06, (state, k)
+            assert np.quantile(distance, 0.95) < 0.065, (state, k)  # voxels are 0.03, Gaussians as far apart
             assert len(mesh.faces) > 200
     front = read_mesh(run / "meshes" / "start" / "part_2.ply").vertices
-    assert abs(np.quantile(front[:, 1], 0.02) + 0.43) < 0.03  # Gaussians of a third of a voxel's depth and fuzzy rims
+    assert abs(np.quantile(front[:, 1], 0.02) + 0.43) < 0.035  # Gaussians of a third of a voxel's depth and fuzzy rims
     moved = read_mesh(run / "meshes" / "end" / "part_2.ply").vertices
     assert np.allclose(moved - front, [0, -0.4, 0], atol=1e-5)
     whole = read_mesh(run / "meshes" / "end" / "whole.ply")

@@ -142,10 +142,73 @@ def test_usd_text_is_complete(run, joints):
     text = (run / "twin.usda").read_text()
     assert text.startswith("#usda 1.0") and text.count("{") == text.count("}") and text.count('def Mesh "visual"') == 3
     assert 'def PhysicsRevoluteJoint "joint_1"' in text and 'def PhysicsPrismaticJoint "joint_2"' in text
-    pxr = pytest.importorskip("pxr", reason="usd-core is not installed")
-    stage = pxr.Usd.Stage.Open(str(run / "twin.usda"))
-    joint = pxr.UsdPhysics.RevoluteJoint(stage.GetPrimAtPath("/twin/joint_1"))
-    assert math.isclose(joint.GetLowerLimitAttr().Get(), joints[1]["motion"], abs_tol=1e-4)
+
+
+def test_usd_opens_in_usd_core_and_agrees_with_the_twin(run, joints):
+    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[usd])")
+    from pxr import Gf, Usd, UsdGeom, UsdPhysics
+
+    stage = Usd.Stage.Open(str(run / "twin.usda"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and math.isclose(UsdGeom.GetStageMetersPerUnit(stage), 1.0)
+    for k, joint in joints.items():
+        kind = UsdPhysics.RevoluteJoint if joint["type"] == "revolute" else UsdPhysics.PrismaticJoint
+        got = kind(stage.GetPrimAtPath(f"/twin/joint_{k}"))
+        limits = [got.GetLowerLimitAttr().Get(), got.GetUpperLimitAttr().Get()]
+        assert np.allclose(np.radians(limits) if joint["type"] == "revolute" else limits, sorted([0, si(joint)]), atol=1e-6)
+        axis = Gf.Rotation(Gf.Quatd(got.GetLocalRot0Attr().Get())).TransformDir(Gf.Vec3d(1, 0, 0))
+        assert np.allclose(axis, joint["axis"], atol=1e-6) and np.allclose(got.GetLocalPos0Attr().Get(), joint["origin"], atol=1e-6)
+    cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])
+    box = cache.ComputeWorldBound(stage.GetPrimAtPath("/twin")).ComputeAlignedRange()
+    want = trimesh.load(run / "meshes" / "start" / "whole.ply", process=False).bounds
+    assert np.allclose([box.GetMin(), box.GetMax()], want, atol=0.02)
+
+
+TURNS = {"z": np.eye(3), "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])}
+
+
+@pytest.mark.parametrize("up, origin, scale", [("y", "bottom", 0.5), ("x", "center", 2.0), ("z", "keep", 0.1)])
+def test_every_format_stands_where_scale_up_and_origin_say(run, joints, tmp_path, up, origin, scale):
+    """Joints and surfaces of URDF, MJCF, GLB and USD are those of twin.json under one and the same x -> scale R (x - origin)."""
+    import mujoco
+    import yourdfpy
+
+    export_run(run, ["urdf", "mjcf", "glb"], tmp_path, scale=scale, up=up, origin=origin)
+    points = np.concatenate([trimesh.load(run / "meshes" / "start" / f"part_{k}.ply", process=False).vertices for k in range(3)])
+    lo, hi = points.min(0), points.max(0)
+    where = {"keep": np.zeros(3), "center": (lo + hi) / 2, "bottom": np.array([*(lo + hi)[:2] / 2, lo[2]])}[origin]
+    R = TURNS[up]
+    moved = scale * (points - where) @ R.T
+    box = np.array([moved.min(0), moved.max(0)])
+    near = 0.02 * scale
+
+    robot = yourdfpy.URDF.load(str(tmp_path / "twin.urdf"))
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "twin.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    glb = trimesh.load(tmp_path / "twin.glb")
+    assert np.allclose(robot.scene.bounds, box, atol=near) and np.allclose(glb.bounds, box, atol=near)
+    down = -np.eye(3)["xyz".index(up)]
+    assert np.allclose(model.opt.gravity / np.linalg.norm(model.opt.gravity), down)
+    for k, joint in joints.items():
+        at, axis = scale * R @ (np.array(joint["origin"]) - where), R @ np.array(joint["axis"])
+        reach = math.radians(joint["motion"]) if joint["type"] == "revolute" else scale * joint["motion"]
+        got = robot.joint_map[f"joint_{k}"]
+        assert np.allclose(got.axis, axis, atol=1e-6) and np.allclose(got.origin[:3, 3], at, atol=1e-6)
+        assert np.allclose([got.limit.lower, got.limit.upper], sorted([0, reach]), atol=1e-6)
+        number = model.joint(f"joint_{k}").id
+        assert np.allclose(data.xaxis[number], axis, atol=1e-6) and np.allclose(data.xanchor[number], at, atol=1e-6)
+        assert np.allclose(model.jnt_range[number], sorted([0, reach]), atol=1e-6)
+        assert np.allclose(glb.graph.get(f"part_{k}")[0][:3, 3], at, atol=1e-6)
+    if up == "x":
+        with pytest.raises(UserError, match="a USD stage stands on y or z"):
+            export_run(run, ["usd"], tmp_path, up=up)
+        return
+    text = export_run(run, ["usd"], tmp_path, scale=scale, up=up, origin=origin)[0].read_text()
+    assert f'upAxis = "{up.upper()}"' in text
+    for k, joint in joints.items():
+        block = text[text.index(f'Joint "joint_{k}"') :]
+        got = [float(x) for x in block[block.index("localPos0 = (") + 13 :].split(")")[0].split(",")]
+        assert np.allclose(got, scale * R @ (np.array(joint["origin"]) - where), atol=1e-6)
 
 
 def test_scale_up_and_origin(run, joints, tmp_path):
