@@ -46,3 +46,41 @@ class DepthVariance(Loss):
         if render is None or target is None or render.depth_sq is None:
             return None
         return 2 * depth_spread(render.alpha, render.depth, render.depth_sq, target.alpha, render.depth_ref)
+
+
+@register_loss("planar")
+class Planar(Loss):
+    """Where a photograph shows nothing between two pixels, the surface between them is flat. Not in the paper.
+
+    Second differences of inverse depth (zero on a plane, in every perspective) over segments of 2 x ``strides`` pixels along rows and
+    columns, in units of depth, each weighted by exp(-t / contrast), t the photograph's total variation along the segment less
+    ``noise`` a pixel. Segments that leave the foreground do not count. Photometric error cannot see dents in plain walls; their rims
+    it can, and this carries the rim's depth inwards.
+    """
+
+    weight: float = 0.1
+    strides: tuple[int, ...] = (3, 9, 27)
+    contrast: float = 0.1
+    noise: float = 0.01
+
+    def compute(self, inputs: LossInputs) -> Tensor | None:
+        render, target = inputs.render, inputs.target
+        if render is None or target is None or render.expected_depth is None:
+            return None
+        inside = (target.alpha > 0.9) & (render.alpha.detach() > 0.5)
+        depth = torch.where(inside, render.expected_depth, torch.ones_like(render.expected_depth)).clamp_min(1e-3)
+        total, count = depth.new_zeros(()), 0
+        for image, d, mask in ((target.image, depth, inside), (target.image.transpose(0, 1), depth.T, inside.T)):
+            step = ((image[1:] - image[:-1]).abs().mean(-1) - self.noise).clamp_min(0)
+            # a step over the outline counts so much that nothing is left of the weight, and no more: sums keep their precision
+            step = torch.where(mask[1:] & mask[:-1], step, torch.full_like(step, 30 * self.contrast))
+            travelled = torch.cat([step.new_zeros(1, step.shape[1]), step.cumsum(0)])
+            inverse = 1 / d
+            for s in self.strides:
+                if len(d) <= 2 * s:
+                    continue
+                bend = inverse[: -2 * s] - 2 * inverse[s:-s] + inverse[2 * s :]
+                w = torch.exp((travelled[: -2 * s] - travelled[2 * s :]) / self.contrast)
+                total = total + (w * bend.abs() * d[s:-s].detach().square()).sum() / w.sum().clamp_min(1)
+                count += 1
+        return total / count if count else None

@@ -12,7 +12,7 @@ from p2gs.models.canonical import carry, with_static
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.joint_confidence import JointEvidence, measure_joints, measuring_level, state_depth
 from p2gs.models.joint_range import extend_ranges
-from p2gs.models.part_motions import refine
+from p2gs.models.part_motions import refine, single_ways
 from p2gs.models.phase import PHASES
 from p2gs.models.screw_polish import PolishConfig, photometric_cost
 from p2gs.ops import se3, so3
@@ -46,7 +46,7 @@ class FinishRecord:
     """What the last stage measured, for the diagnosis.
 
     labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the polish
-    (start -> end, internal units); polish: what ``refine`` tells of its two directions ({} without polish).  costs: image loss of the
+    (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
     start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.  slots: the
     learned slot of each part.
     """
@@ -169,7 +169,8 @@ def finish(
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         refined = refine(states, motions, views, config.polish, seed=seed, backend=backend, device=device)
         transforms = refined.transforms
-        record.after, record.polish = transforms, refined.diagnostics.get("polish", {})
+        record.after = transforms
+        record.polish = single_ways(states, refined, views, config.polish, seed=seed, backend=backend, device=device)
         measure(record, states, types, views, backend, device)
     parts = [Part(0, None, int((labels == 0).sum()))]
     for k, kind in enumerate(types):

@@ -5,7 +5,7 @@ Not a training phase of the paper: its ancestors need hand-made part centres or 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from p2gs.models.discovery import DiscoveryConfig, discover
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.phase import PHASES
-from p2gs.models.screw_polish import PolishConfig, average_motion, photometric_cost, polish
+from p2gs.models.screw_polish import PolishConfig, Side, photometric_cost, polish
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import TwoStateScene, UserError
@@ -139,43 +139,31 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
     return torch.where(motions.margin[state] >= min_margin, motions.labels[state], -1)
 
 
-def refine(
-    states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu", types=None, both: bool = True
-) -> PartMotions:
-    """Photometric refinement of all motions: start into end images, then end into start images; the mean.
+def sides_of(states, motions: PartMotions, views, min_margin: float) -> list[Side]:
+    """Both directions: the start's Gaussians against the end's photographs, and the reverse."""
+    return [Side(states[s].gaussians, polish_labels(motions, s, min_margin), views[1 - s], back=s == 1) for s in (0, 1)]
 
-    The result's ``diagnostics["polish"]`` holds both ("forward", "backward", each start -> end) and their last losses.
-    """
+
+def refine(states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu") -> PartMotions:
+    """Photometric refinement of all motions, both directions at once."""
     if config.steps <= 0 or len(motions) == 0:
         return motions
-    types = types or motions.types
-    forward, there = polish(
-        states[0].gaussians,
-        polish_labels(motions, 0, config.min_margin),
-        motions.transforms,
-        types,
-        views[1],
-        config,
-        seed=seed,
-        backend=backend,
-        device=device,
-    )
-    result, ways = forward, {"forward": forward, "loss_forward": there["loss"]}
-    if both:
-        backward, back = polish(
-            states[1].gaussians,
-            polish_labels(motions, 1, config.min_margin),
-            se3.inverse(forward),
-            types,
-            views[0],
-            config,
-            seed=seed + 1,
-            backend=backend,
-            device=device,
-        )
-        result = torch.stack([average_motion(a, se3.inverse(b)) for a, b in zip(forward, backward)])
-        ways |= {"backward": se3.inverse(backward), "loss_backward": back["loss"]}
-    return PartMotions(motions.types, result, motions.confidence, motions.labels, motions.margin, {**motions.diagnostics, "polish": ways})
+    sides = sides_of(states, motions, views, config.min_margin)
+    result, _ = polish(sides, motions.transforms, motions.types, config, seed=seed, backend=backend, device=device)
+    return PartMotions(motions.types, result, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
+
+
+def single_ways(states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu") -> dict:
+    """Where each direction alone takes refined motions: {"forward", "backward"} [K-1, 4, 4], both start -> end.
+
+    A third of the polish's steps at half its rate. How far the two come apart tells how sure the photographs are.
+    """
+    if config.steps <= 0 or len(motions) == 0:
+        return {}
+    short = replace(config, steps=max(config.steps // 3, 1), rate=config.rate / 2)
+    sides = sides_of(states, motions, views, config.min_margin)
+    found = [polish([side], motions.transforms, motions.types, short, seed=seed, backend=backend, device=device) for side in sides]
+    return {name: T for name, (T, _) in zip(("forward", "backward"), found, strict=True)}
 
 
 def explanation_cost(states, motions: PartMotions, views, level: int, backend: str, device="cpu") -> float:

@@ -140,40 +140,58 @@ def apply_step(T: Tensor, centre: Tensor, radius: float, step: Tensor) -> Tensor
     return delta @ T
 
 
+@dataclass
+class Side:
+    """Frozen Gaussians of one state, labels [N] (part of each, -1 leaves it out) and the other state's photographs.
+
+    back: they are the end state's, carried to the start.
+    """
+
+    gaussians: GaussianTensors
+    labels: Tensor
+    views: TrainingViews
+    back: bool = False
+
+
 def polish(
-    gaussians: GaussianTensors,
-    labels: Tensor,
+    sides: list[Side],
     transforms: Tensor,
     types: list[str],
-    views: TrainingViews,
     config: PolishConfig,
     *,
     seed: int,
     backend: str = "auto",
     device: torch.device | str = "cpu",
-) -> tuple[Tensor, dict]:
-    """Refine ``transforms`` [K-1, 4, 4] (this state -> the views' state) so that the moved Gaussians match the views.
+) -> tuple[Tensor, list[float]]:
+    """Refine ``transforms`` [K-1, 4, 4] (start -> end) so that the moved Gaussians match the photographs of all sides at once.
 
-    labels [N]: part of each Gaussian, -1 leaves it out.  types: "revolute" | "prismatic" | "free" per movable part.
-    Returns (transforms float64, {"loss": mean loss over the last tenth}).
+    Steps look at the sides in turn and share one descent: where one state's surfaces are wrong its own optimum is wrong too, and a mean
+    of two optima with it; the sum of both losses has its minimum near the truth. A backward step of B = T^-1 about a point a is
+    the forward one about T a with its vectors turned by -R.
+    types: "revolute" | "prismatic" | "free" per movable part. ``config.steps`` are taken per side.
+    Returns (transforms float64, each side's mean loss over the last tenth).
     """
     transforms = transforms.double().clone()
     if config.steps <= 0 or len(transforms) == 0:
-        return transforms, {"loss": float("nan")}
-    solid = torch.sigmoid(gaussians.opacity_logits) > config.min_opacity
-    body = MovedGaussians(gaussians, torch.where(solid, labels, -1), device)
-    rows = [body.rows(k + 1) for k in range(len(transforms))]
-    radius, first, second = [], torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
-    for r in rows:
-        spread = (body.g.means[r] - body.g.means[r].mean(0)).norm(dim=1) if r.numel() else torch.ones(1)
-        radius.append(max(float(spread.square().mean().sqrt()), 1e-3))
-    losses = []
-    for step in range(config.steps):
-        fraction = step / config.steps
-        generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
+        return transforms, [float("nan")] * len(sides)
+    bodies = []
+    for side in sides:
+        solid = torch.sigmoid(side.gaussians.opacity_logits) > config.min_opacity
+        bodies.append(MovedGaussians(side.gaussians, torch.where(solid, side.labels, -1), device))
+    rows = [[body.rows(k + 1) for k in range(len(transforms))] for body in bodies]
+    anchors, radius = _anchors(sides, bodies, rows, transforms)
+    first, second = torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
+    taken = [0] * len(transforms)
+    losses: list[list[float]] = [[] for _ in sides]
+    total = config.steps * len(sides)
+    for step in range(total):
+        turn, number = step % len(sides), step // len(sides)
+        side, body, fraction = sides[turn], bodies[turn], step / total
+        generator = torch.Generator().manual_seed((seed + side.back) * 1_000_003 + number)
         background = torch.rand(3, generator=generator)
-        shot = views.get(view_index(seed + 13, step, len(views)), views.levels.index(config.level(fraction)), background)
-        means, quats, sh = body.moved(transforms)
+        index = view_index(seed + side.back + 13, number, len(side.views))
+        shot = side.views.get(index, side.views.levels.index(config.level(fraction)), background)
+        means, quats, sh = body.moved(se3.inverse(transforms) if side.back else transforms)
         means.requires_grad_(True)
         quats.requires_grad_(True)
         out = body.render(means, quats, sh, shot.camera, background, backend)
@@ -181,16 +199,21 @@ def polish(
         loss.backward()
         rate = config.rate * exponential(1.0, 0.01, fraction)
         if fraction >= 0.9:
-            losses.append(float(loss.detach()))
-        for k, r in enumerate(rows):
+            losses[turn].append(float(loss.detach()))
+        for k, r in enumerate(rows[turn]):
             if r.numel() < 10:
                 continue
-            centre = means.detach()[r].double().mean(0)
-            rotation, translation = tangent_gradient(means.detach()[r], quats.detach()[r], means.grad[r], quats.grad[r], centre)
-            gradient, centre = torch.cat([rotation / radius[k], translation]).cpu(), centre.cpu()
+            here = anchors[k] if side.back else se3.apply(transforms[k], anchors[k][None])[0]
+            at = means.detach()[r], quats.detach()[r], means.grad[r], quats.grad[r]
+            rotation, translation = (v.cpu() for v in tangent_gradient(*at, here.to(means.device)))
+            if side.back:
+                rotation, translation = (-transforms[k, :3, :3] @ v for v in (rotation, translation))
+            gradient = torch.cat([rotation / radius[k], translation])
+            taken[k] += 1
             first[k] = 0.9 * first[k] + 0.1 * gradient
             second[k] = 0.99 * second[k] + 0.01 * gradient * gradient
-            direction = first[k] / (1 - 0.9 ** (step + 1)) / ((second[k] / (1 - 0.99 ** (step + 1))).sqrt() + 1e-12)
+            direction = first[k] / (1 - 0.9 ** taken[k]) / ((second[k] / (1 - 0.99 ** taken[k])).sqrt() + 1e-12)
+            centre = se3.apply(transforms[k], anchors[k][None])[0]
             delta = allowed_step(types[k], transforms[k], centre, radius[k], -rate * direction)
             transforms[k] = apply_step(transforms[k], centre, radius[k], delta)
             if types[k] == "prismatic":
@@ -198,7 +221,24 @@ def polish(
     for k, kind in enumerate(types):
         if kind == "revolute":
             transforms[k] = se3.project_revolute(transforms[k])  # what pitch the last steps left
-    return transforms, {"loss": sum(losses) / max(len(losses), 1)}
+    return transforms, [sum(of) / max(len(of), 1) for of in losses]
+
+
+def _anchors(sides, bodies, rows, transforms: Tensor) -> tuple[list[Tensor], list[float]]:
+    """Each part's centre at the start [3] (float64, CPU) and the spread of its points, means over the sides."""
+    anchors, radius = [], []
+    for k in range(len(transforms)):
+        centres, spreads = [], []
+        for side, body, r in zip(sides, bodies, (of[k] for of in rows), strict=True):
+            if r.numel() == 0:
+                continue
+            points = body.g.means[r].double().cpu()
+            centre = points.mean(0)
+            spreads.append(float((points - centre).square().sum(1).mean().sqrt()))
+            centres.append(se3.apply(se3.inverse(transforms[k]), centre[None])[0] if side.back else centre)
+        anchors.append(torch.stack(centres).mean(0) if centres else torch.zeros(3, dtype=torch.float64))
+        radius.append(max(sum(spreads) / max(len(spreads), 1), 1e-3))
+    return anchors, radius
 
 
 @torch.no_grad()
@@ -224,8 +264,3 @@ def photometric_cost(
         out = body.render(means, quats, sh, shot.camera, background, backend)
         total += float(l1_ssim(out.colour, shot.image.to(out.colour.device), ssim_lambda))
     return total / len(picked)
-
-
-def average_motion(forward: Tensor, backward: Tensor) -> Tensor:
-    """Mean of two estimates of one rigid motion [4, 4] (the second given inverted back): halfway along the screw between them."""
-    return forward @ se3.screw_at(se3.inverse(forward) @ backward, 0.5)

@@ -15,6 +15,7 @@ from p2gs.models.handover import StateGaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
 from p2gs.models.phase import Phase, PhaseConfig, exponential, register_phase
 from p2gs.models.splats import Splats
+from p2gs.models.visibility import visible_share
 from p2gs.render import rasterize
 from p2gs.types import Camera, GaussianTensors, RenderOutput, TwoStateScene
 
@@ -59,7 +60,8 @@ class SingleStateConfig(ImageConfig):
 
     steps: paper 30,000.  initial_gaussians: random points in the object's box (or depth points where ``init`` says so).
     sh_degree: 0-3.  sh_every: steps until the next degree is switched on.  init: "auto" takes depth points where the scene has
-    depth, "random" never does.  initial_opacity: low, so that concavities stay open until the images fill them.
+    depth, "random" never does.  initial_opacity: low, so that concavities stay open until the images fill them.  min_visible: Gaussians
+    of which no training view sees this share are left out at the end: nothing formed them (0 = keep all).
     """
 
     steps: int = 6000
@@ -68,6 +70,7 @@ class SingleStateConfig(ImageConfig):
     init: Literal["auto", "random"] = "auto"
     sh_degree: int = 1
     sh_every: int = 500
+    min_visible: float = 0.1
     rates: SplatRates = field(default_factory=SplatRates)
 
 
@@ -174,7 +177,11 @@ class SingleStatePhase(ImagePhase):
         return LossInputs(step, self.total_steps, g, render, target, camera, cache=self.loss_cache)
 
     def hand_over(self) -> StateGaussians:
-        return StateGaussians(self.state, self.splats.tensors().clone())
+        g, views = self.splats.tensors().clone(), self.views[self.state]
+        if self.config.min_visible > 0 and len(g):
+            cameras = [views.camera(i, views.levels.index(self.config.levels[-1])) for i in range(len(views))]
+            g = g[visible_share(g, cameras, self.rasterizer, g.means.device) >= self.config.min_visible]
+        return StateGaussians(self.state, g)
 
     @torch.no_grad()
     def preview(self, times: list[float]) -> dict[str, Tensor]:
