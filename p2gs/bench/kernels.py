@@ -219,7 +219,8 @@ def main(words: list[str]) -> int:
     """``p2gs bench kernels``: the arguments behind these words; returns the exit code."""
     parser = argparse.ArgumentParser(prog="p2gs bench kernels", description="Time the rasterizer and the training step on this machine.")
     parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
-    parser.add_argument("--json", dest="json_path", nargs="?", const="-", metavar="FILE", help="also write the rows there, or to standard output")
+    where = "also write the rows there, or to standard output"
+    parser.add_argument("--json", dest="json_path", nargs="?", const="-", metavar="FILE", help=where)
     parser.add_argument("--quick", action="store_true", help="fewer sizes, under a minute")
     parser.add_argument("--all-isas", action="store_true", help="every instruction set this machine runs")
     bench_kernels(**vars(parser.parse_args(words)))
