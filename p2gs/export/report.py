@@ -173,12 +173,20 @@ def is_loss(tag: str) -> bool:
 
 
 def read_scalars(folder: Path) -> dict[str, np.ndarray]:
-    """tag -> [n, 2] (step, value)."""
+    """tag -> [n, 2] (step, value), steps rising: where a stage was run again, what is newer replaces the older from its step on."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 400})
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 2000})
     events.Reload()
-    return {tag: np.array([(e.step, e.value) for e in events.Scalars(tag)]) for tag in events.Tags()["scalars"]}
+    out = {}
+    for tag in events.Tags()["scalars"]:
+        kept: list[tuple[int, float]] = []
+        for e in sorted(events.Scalars(tag), key=lambda e: e.wall_time):
+            while kept and kept[-1][0] >= e.step:
+                kept.pop()
+            kept.append((e.step, e.value))
+        out[tag] = np.array(kept)
+    return out
 
 
 def chart(curves: dict[str, np.ndarray], width: int = 640, height: int = 180) -> str:

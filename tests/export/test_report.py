@@ -101,3 +101,16 @@ def test_in_a_browser_the_slider_moves_the_part(run, tmp_path):
     canvas = slice(100, 400)
     assert shots[0][canvas].std() > 5  # not an empty view
     assert (np.abs(shots[0] - shots[1])[canvas].max(-1) > 30).mean() > 0.01
+
+
+def test_a_stage_run_again_draws_one_curve(tmp_path):
+    from torch.utils.tensorboard import SummaryWriter
+
+    from p2gs.export.report import read_scalars
+
+    for sitting, steps in enumerate((range(0, 10), range(4, 8))):
+        writer = SummaryWriter(str(tmp_path), filename_suffix=str(sitting))
+        for step in steps:
+            writer.add_scalar("loss/render", 10.0 * sitting + step, step, walltime=1000.0 * sitting + step)
+        writer.close()
+    assert read_scalars(tmp_path)["loss/render"].tolist() == [[0, 0], [1, 1], [2, 2], [3, 3], [4, 14], [5, 15], [6, 16], [7, 17]]
