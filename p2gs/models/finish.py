@@ -167,11 +167,13 @@ def finish(
     record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive)
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
-        refined = refine(states, motions, views, config.polish, seed=seed, backend=backend, device=device)
+        level = min(measuring_level(views[s]) for s in (0, 1))
+        stacks = [state_depth(state, views[s], level, backend=backend, device=device) for s, state in enumerate(states)]
+        refined = refine(states, motions, views, config.polish, stacks, seed=seed, backend=backend, device=device)
         transforms = refined.transforms
         record.after = transforms
-        record.polish = single_ways(states, refined, views, config.polish, seed=seed, backend=backend, device=device)
-        measure(record, states, types, views, backend, device)
+        record.polish = single_ways(states, refined, views, config.polish, stacks, seed=seed, backend=backend, device=device)
+        measure(record, states, types, views, stacks, level, backend, device)
     parts = [Part(0, None, int((labels == 0).sum()))]
     for k, kind in enumerate(types):
         rows = labels == k + 1
@@ -185,17 +187,15 @@ def finish(
 
 
 def measure(
-    record: FinishRecord, states: list[StateGaussians], types: list[str], views: dict[int, TrainingViews], backend: str, device
+    record: FinishRecord, states: list[StateGaussians], types: list[str], views: dict[int, TrainingViews], stacks, level: int, backend: str, device
 ) -> None:
-    """Fill in ``costs`` and ``evidence``."""
-    level = min(measuring_level(views[s]) for s in (0, 1))
+    """Fill in ``costs`` and ``evidence``. stacks: rendered depth of both states; level: image size."""
     options = {"level": level, "backend": backend, "device": device}
     for name, T in (("before", record.before), ("after", record.after)):
         ways = (T, se3.inverse(T))
         record.costs[name] = [
             photometric_cost(states[s].gaussians, record.labels[s], ways[s], views[1 - s], count=8, **options) for s in (0, 1)
         ]
-    stacks = [state_depth(state, views[s], level, backend=backend, device=device) for s, state in enumerate(states)]
     both = [record.polish[w] for w in ("forward", "backward")] if "backward" in record.polish else None
     record.evidence = measure_joints(states, record.labels, record.after, types, views, stacks, both=both, **options)
 

@@ -12,7 +12,9 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews
 from p2gs.models.discovery import DiscoveryConfig, discover
+from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import gather_evidence
+from p2gs.models.free_space import seen_through
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.phase import PHASES
 from p2gs.models.screw_polish import PolishConfig, Side, photometric_cost, polish
@@ -76,6 +78,7 @@ def find_part_motions(
         if len(seen.points) < 10 or not any(bool((d > 0).any()) for d in seen.depths):
             name = ("start", "end")[s.state]
             raise UserError(f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)")
+    stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in evidence]
     say("looking for parts")
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
     explanations = _explanations(found)[: max(config.candidates, 1)]
@@ -84,7 +87,7 @@ def find_part_motions(
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
             say(f"re-rendering explanation {number + 1} of {len(explanations)}")
-        motions = refine(states, motions, views, config.coarse, seed=seed, backend=backend, device=device)
+        motions = refine(states, motions, views, config.coarse, stacks, seed=seed, backend=backend, device=device)
         reductions: list[dict] = []
         motions = simplify(states, motions, views, config, backend=backend, device=device, log=reductions)
         cost = explanation_cost(states, motions, views, level, backend, device)
@@ -94,7 +97,7 @@ def find_part_motions(
         if best is None or rank < best[0]:
             best = (rank, motions, number)
     motions = best[1]
-    motions = settle_types(states, motions, views, config, seed=seed, backend=backend, device=device)
+    motions = settle_types(states, motions, views, config, stacks, seed=seed, backend=backend, device=device)
     motions.diagnostics = {
         "explanation": best[2],
         "photometric_costs": costs,
@@ -139,21 +142,36 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
     return torch.where(motions.margin[state] >= min_margin, motions.labels[state], -1)
 
 
-def sides_of(states, motions: PartMotions, views, min_margin: float) -> list[Side]:
-    """Both directions: the start's Gaussians against the end's photographs, and the reverse."""
-    return [Side(states[s].gaussians, polish_labels(motions, s, min_margin), views[1 - s], back=s == 1) for s in (0, 1)]
+def sides_of(states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack]) -> list[Side]:
+    """Both directions: the start's Gaussians against the end's photographs, and the reverse.
+
+    stacks: rendered depth of both states. What the other state sees through is left out: no motion can make it fit.
+    """
+    sides = []
+    for s in (0, 1):
+        g, labels = states[s].gaussians, polish_labels(motions, s, config.min_margin)
+        if config.free_static > 0 and config.free_moving > 0:
+            T = se3.inverse(motions.transforms) if s else motions.transforms
+            through = seen_through(g.means, motions.labels[s], T, stacks[1 - s], config.free_static, config.free_moving)
+            labels = torch.where(through, -1, labels)
+        sides.append(Side(g, labels, views[1 - s], back=s == 1))
+    return sides
 
 
-def refine(states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu") -> PartMotions:
+def refine(
+    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], *, seed: int, backend: str, device="cpu"
+) -> PartMotions:
     """Photometric refinement of all motions, both directions at once."""
     if config.steps <= 0 or len(motions) == 0:
         return motions
-    sides = sides_of(states, motions, views, config.min_margin)
+    sides = sides_of(states, motions, views, config, stacks)
     result, _ = polish(sides, motions.transforms, motions.types, config, seed=seed, backend=backend, device=device)
     return PartMotions(motions.types, result, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
 
 
-def single_ways(states, motions: PartMotions, views, config: PolishConfig, *, seed: int, backend: str, device="cpu") -> dict:
+def single_ways(
+    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], *, seed: int, backend: str, device="cpu"
+) -> dict:
     """Where each direction alone takes refined motions: {"forward", "backward"} [K-1, 4, 4], both start -> end.
 
     A third of the polish's steps at half its rate. How far the two come apart tells how sure the photographs are.
@@ -161,7 +179,7 @@ def single_ways(states, motions: PartMotions, views, config: PolishConfig, *, se
     if config.steps <= 0 or len(motions) == 0:
         return {}
     short = replace(config, steps=max(config.steps // 3, 1), rate=config.rate / 2)
-    sides = sides_of(states, motions, views, config.min_margin)
+    sides = sides_of(states, motions, views, config, stacks)
     found = [polish([side], motions.transforms, motions.types, short, seed=seed, backend=backend, device=device) for side in sides]
     return {name: T for name, (T, _) in zip(("forward", "backward"), found, strict=True)}
 
@@ -244,7 +262,9 @@ def without_part(motions: PartMotions, index: int, into: int) -> PartMotions:
     )
 
 
-def settle_types(states, motions: PartMotions, views, config: PartMotionsConfig, *, seed: int, backend: str, device="cpu") -> PartMotions:
+def settle_types(
+    states, motions: PartMotions, views, config: PartMotionsConfig, stacks: list[DepthStack], *, seed: int, backend: str, device="cpu"
+) -> PartMotions:
     """Fit both joint types where the angle leaves room for doubt, keep the one the images prefer; then refine with the types held."""
     level = config.coarse.levels[-1]
     for k in range(len(motions)):
@@ -258,7 +278,7 @@ def settle_types(states, motions: PartMotions, views, config: PartMotionsConfig,
         slide[k, :3, 3] = motions.transforms[k, :3, :3] @ centre + motions.transforms[k, :3, 3] - centre
         types = [*motions.types[:k], "prismatic", *motions.types[k + 1 :]]
         other = PartMotions(types, slide, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
-        other = refine(states, other, views, config.coarse, seed=seed, backend=backend, device=device)
+        other = refine(states, other, views, config.coarse, stacks, seed=seed, backend=backend, device=device)
         if explanation_cost(states, other, views, level, backend, device) <= explanation_cost(
             states, motions, views, level, backend, device
         ) * (1 + config.freedom_penalty):

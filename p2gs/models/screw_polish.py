@@ -27,7 +27,8 @@ class PolishConfig:
     steps: per direction (0 = off).  levels, level_starts: image sizes over the steps.  rate: step size at the start in internal
     units of displacement at the part's rim; falls to a hundredth.  ssim_lambda: weight of SSIM against L1; high, because shading
     differs between states while structure does not.  min_margin: Gaussians whose label is less clear than this (internal units)
-    are left out.
+    are left out.  free_static, free_moving: so are those which the other state's cameras see through by more than this, of the base and
+    of moving parts (internal units; 0 = kept).
     """
 
     steps: int = 200
@@ -37,6 +38,8 @@ class PolishConfig:
     ssim_lambda: float = 0.8
     min_margin: float = 0.01
     min_opacity: float = 0.05
+    free_static: float = 0.02
+    free_moving: float = 0.05
 
     def level(self, fraction: float) -> int:
         return [size for size, start in zip(self.levels, self.level_starts) if fraction >= start][-1]
