@@ -21,7 +21,7 @@ from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors
 
-IMAGE_LOSSES = ("render", "alpha", "depth", "depth_variance", "opacity")  # they look at no part state, which costs time to make
+IMAGE_LOSSES = ("render", "alpha", "depth", "depth_variance", "planar", "opacity")  # they look at no part state, which costs time to make
 
 
 @dataclass

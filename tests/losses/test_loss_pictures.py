@@ -130,9 +130,72 @@ def test_gradients_against_finite_differences(name):
     assert gradcheck(value, [getattr(r, f).clone().requires_grad_() for f in fields], eps=1e-7, atol=1e-4)
 
 
+def wall(depth, image=None):
+    """A view [H, W] of what lies at ``depth``, photographed as ``image`` (default: one colour), seen everywhere."""
+    h, w = depth.shape
+    ones = torch.ones(h, w, dtype=F64)
+    image = torch.full((h, w, 3), 0.5, dtype=F64) if image is None else image
+    render = RenderOutput(image, ones, depth.clone(), None, depth_ref=0.0)
+    return LossInputs(0, 100, None, render, Target(image, ones, torch.ones(3, dtype=F64)))
+
+
+def tilted(h=30, w=40):
+    """Depth of a tilted plane under a pinhole: its inverse is linear in the pixel."""
+    y, x = torch.meshgrid(torch.arange(h, dtype=F64), torch.arange(w, dtype=F64), indexing="ij")
+    return 1 / (0.4 + 0.002 * x - 0.003 * y)
+
+
+def test_planar_is_nothing_on_a_plane_and_something_on_a_dent():
+    loss, plane = LOSSES["planar"](weight=1.0), tilted()
+    assert loss(wall(plane)).item() < 1e-12
+    y, x = torch.meshgrid(torch.arange(30), torch.arange(40), indexing="ij")
+    dent = 0.05 * torch.exp(-((x - 20) ** 2 + (y - 15) ** 2) / 50.0)
+    shallow, deep = (loss(wall(plane + k * dent)).item() for k in (1.0, 2.0))
+    assert 1.8 < deep / shallow < 2.2 and shallow > 1e-4
+    # where the photograph shows something, it decides
+    pattern = torch.rand(30, 40, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    assert loss(wall(plane + dent, pattern)).item() < 0.02 * shallow
+
+
+def test_planar_stops_at_edges_of_the_photograph_and_at_the_outline():
+    loss, near = LOSSES["planar"](weight=1.0, strides=(3,)), torch.full((24, 24), 2.0, dtype=F64)
+    step = near.clone()
+    step[:, 12:] = 3.0
+    image = torch.full((24, 24, 3), 0.2, dtype=F64)
+    image[:, 12:] = 0.9  # the edge of a body is an edge of the picture
+    assert loss(wall(step)).item() > 0.05 > 20 * loss(wall(step, image)).item()
+    inputs = wall(step)
+    outline = inputs.target.alpha.clone()
+    outline[:, 12] = 0.0
+    assert loss(replace(inputs, target=replace(inputs.target, alpha=outline))).item() < 1e-9
+
+
+def test_planar_against_its_slow_twin():
+    inputs = make_inputs(20, 23)
+    inputs = replace(inputs, render=replace(inputs.render, alpha=0.6 + 0.4 * inputs.render.alpha))
+    r, t, loss = inputs.render, inputs.target, LOSSES["planar"](weight=1.0, strides=(2, 4), contrast=2.0)
+    inside = (t.alpha > 0.9) & (r.alpha > 0.5)
+    depth, terms = r.depth / r.alpha, []
+    for dy, dx in ((1, 0), (0, 1)):
+        for s in loss.strides:
+            total = weights = 0.0
+            for y in range(20 - 2 * s * dy):
+                for x in range(23 - 2 * s * dx):
+                    line = [(y + i * dy, x + i * dx) for i in range(2 * s + 1)]
+                    if not all(inside[p] for p in line):
+                        continue
+                    tv = sum(max((t.image[a] - t.image[b]).abs().mean().item() - loss.noise, 0) for a, b in zip(line, line[1:], strict=False))
+                    z = [depth[line[i]].item() for i in (0, s, 2 * s)]
+                    w = math.exp(-tv / loss.contrast)
+                    total += w * abs(1 / z[0] - 2 / z[1] + 1 / z[2]) * z[1] ** 2
+                    weights += w
+            terms.append(total / max(weights, 1))
+    assert loss(inputs).item() == pytest.approx(sum(terms) / len(terms), rel=1e-6)
+
+
 def test_missing_inputs_give_none():
     inputs = make_inputs(depth=False)
-    for name in ("render", "alpha", "depth", "depth_variance"):
+    for name in ("render", "alpha", "depth", "depth_variance", "planar"):
         assert LOSSES[name]()(LossInputs(0, 100, inputs.gaussians)) is None
     assert LOSSES["depth"]()(inputs) is None
     assert LOSSES["depth_variance"]()(replace(inputs, render=replace(inputs.render, depth_sq=None))) is None

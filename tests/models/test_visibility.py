@@ -1,0 +1,57 @@
+"""Who is seen by some view, and who hangs in front of what the other state sees."""
+
+import pytest
+import torch
+from tiny import look_at
+
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.free_space import seen_through
+from p2gs.models.visibility import footprint, visible_share
+from p2gs.render import rasterize
+from p2gs.types import GaussianTensors
+
+
+def gaussians(means, scales, opacity):
+    n = len(means)
+    quats = torch.zeros(n, 4)
+    quats[:, 0] = 1
+    log_scales = torch.as_tensor(scales).log()[:, None].expand(n, 3).clone()
+    return GaussianTensors(means, quats, log_scales, torch.logit(torch.full((n,), opacity)), torch.zeros(n, 1, 3))
+
+
+def ring(size=64, count=6):
+    angle = torch.arange(count) * 2 * torch.pi / count
+    return [look_at(torch.stack([3 * a.cos(), 3 * a.sin(), torch.tensor(1.0)]), size) for a in angle]
+
+
+def test_footprint_is_what_one_gaussian_adds_to_alpha():
+    g = gaussians(torch.tensor([[0.1, -0.2, 0.1]]), torch.tensor([0.08]), 0.7)
+    for camera in ring():
+        out = rasterize(g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh, camera.viewmat, camera.K, 64, 64)
+        assert float(footprint(g, camera)[0]) == pytest.approx(float(out.alpha.sum()), rel=0.03)
+
+
+def test_what_a_shell_encloses_is_hidden_and_the_shell_is_not():
+    torch.manual_seed(0)
+    shell = torch.nn.functional.normalize(torch.randn(6000, 3), dim=1)
+    core = 0.3 * torch.randn(50, 3).clamp(-1, 1)
+    g = gaussians(torch.cat([shell, core]), torch.full((6050,), 0.05), 0.98)
+    share = visible_share(g, ring())
+    assert float(share[6000:].max()) < 0.02
+    assert float((share[:6000] > 0.1).float().mean()) > 0.3  # overlaps hide much, and the ring of cameras does not see the south
+    lone = visible_share(g[torch.tensor([6000])], ring())
+    assert float(lone) == pytest.approx(1.0, abs=0.05)
+
+
+def test_seen_through_by_label_and_tolerance():
+    camera = look_at(torch.tensor([3.0, 0.0, 0.0]), 32)
+    cameras = [camera] * 5
+    flat = torch.full((32, 32), 3.0)  # the other state's surface: the plane through the origin
+    stack = DepthStack([flat] * 5, [torch.ones(32, 32)] * 5, cameras)
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.0, 0.0], [-0.3, 0.0, 0.0]])
+    labels = torch.tensor([0, 0, 0, 1, 0])
+    away = torch.eye(4, dtype=torch.float64)
+    away[0, 3] = -0.16  # carries the moving one to 0.04 in front
+    found = seen_through(points, labels, away[None], stack, 0.02, 0.05)
+    assert found.tolist() == [False, True, True, False, False]
+    assert seen_through(points, labels, away[None], stack, 0.02, 0.03).tolist() == [False, True, True, True, False]
