@@ -116,23 +116,22 @@ def tangent_gradient(means: Tensor, quats: Tensor, grad_means: Tensor, grad_quat
 def allowed_step(kind: str, T: Tensor, centre: Tensor, radius: float, step: Tensor) -> Tensor:
     """Project a tangent step [6] = (rotation * radius, translation) at ``centre`` onto the motions of a joint type.
 
-    Prismatic: no rotation. Revolute: the pitch (translation along the axis) must stay zero, one linear condition, whose normal is
-    taken by differences; a Newton correction removes what pitch there is. Free: as it is.
+    Prismatic: no rotation. Revolute: the pitch (translation along the axis) must stay zero, one linear condition; a Newton correction
+    removes what pitch there is. Free: as it is.
     """
     if kind == "prismatic":
         return torch.cat([torch.zeros(3, dtype=step.dtype), step[3:]])
     if kind == "free":
         return step
 
-    def pitch(delta: Tensor) -> Tensor:
-        moved = apply_step(T, centre, radius, delta)
-        return (so3.matrix_to_rotvec(moved[:3, :3]) / so3.rotation_angle(moved[:3, :3]).clamp_min(1e-6)) @ moved[:3, 3]
-
-    h = 1e-5
-    basis = torch.eye(6, dtype=step.dtype) * h
-    normal = torch.stack([(pitch(e) - pitch(-e)) / (2 * h) for e in basis])
-    value = pitch(torch.zeros(6, dtype=step.dtype))
-    return step - normal * ((normal @ step + value) / (normal @ normal).clamp_min(1e-12))
+    rotvec = so3.matrix_to_rotvec(T[:3, :3])
+    angle = rotvec.norm().clamp_min(1e-3)
+    axis, t = rotvec / angle, T[:3, 3]
+    across = t - axis * (axis @ t)
+    # the axis turns by the inverse left Jacobian of the rotation vector (Sola et al. 2018, arXiv:1812.01537, Eq. 146)
+    tilt = across / (2 * torch.tan(angle / 2)) + torch.linalg.cross(axis, across) / 2
+    normal = torch.cat([(torch.linalg.cross(t - centre, axis) + tilt) / radius, axis])
+    return step - normal * ((normal @ step + axis @ t) / (normal @ normal).clamp_min(1e-12))
 
 
 def apply_step(T: Tensor, centre: Tensor, radius: float, step: Tensor) -> Tensor:

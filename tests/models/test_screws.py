@@ -43,6 +43,22 @@ def test_revolute_steps_keep_the_pitch_zero_and_prismatic_steps_do_not_turn():
     assert torch.equal(allowed_step("free", T, centre, 0.5, free), free)
 
 
+def test_the_forbidden_direction_is_the_derivative_of_the_pitch():
+    torch.manual_seed(2)
+    for _ in range(5):
+        T = se3.from_screw(torch.randn(3).double(), torch.randn(3).double(), 0.3 + 2 * float(torch.rand(1)))
+        centre, radius = torch.randn(3).double(), 0.4
+
+        def pitch(step, T=T, centre=centre, radius=radius):
+            return se3.screw_parameters(apply_step(T, centre, radius, step)).translation
+
+        numeric = torch.stack([(pitch(e) - pitch(-e)) / 2e-6 for e in 1e-6 * torch.eye(6).double()])
+        # what a step loses is along the normal
+        step = torch.randn(6).double()
+        lost = step - allowed_step("revolute", T, centre, radius, step)
+        assert torch.allclose(lost, numeric * (numeric @ step) / (numeric @ numeric), atol=1e-5)
+
+
 @pytest.mark.parametrize("ways", ["forward", "backward", "both"])
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
 def test_polish_recovers_a_known_motion(kind, ways):
