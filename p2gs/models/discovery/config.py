@@ -13,6 +13,7 @@ class DiscoveryConfig:
     max_parts: upper bound (static included) when the number of parts is "auto".
     noise_floor: least depth noise assumed, times the box diagonal.
     tolerance: depth tolerance of the free-space test, times the measured noise.
+    recoloured: a surface that is in place in the other state but differs by this in colour (0..1) has changed there.
     unexplained: cost of a moved point that no motion explains (0.35 is hiding in unseen space, 1 is hanging in free space).
     part_cost: least drop of the mean cost over the moved surface for which a further part is believed ("auto").
     part_cost_fixed: the same below a given number of parts.
@@ -30,6 +31,7 @@ class DiscoveryConfig:
     max_parts: int = 10
     noise_floor: float = 0.001
     tolerance: float = 2.5
+    recoloured: float = 0.2
     unexplained: float = 0.45
     part_cost: float = 0.03
     part_cost_fixed: float = 0.02

@@ -89,8 +89,14 @@ def smooth_mask(points: Tensor, mask: Tensor, k: int = 8) -> Tensor:
     return mask[torch.from_numpy(np.asarray(idx).reshape(len(points), -1))].float().mean(1) > 0.5
 
 
-def evidence_masks(surfels: list[Surfels], stacks: list[DepthStack], tau: float) -> tuple[list[Tensor], list[Tensor]]:
-    """Per state (moved, static) [N] bool: tested against the *other* state's depth maps; the rest is unknown."""
+def evidence_masks(
+    surfels: list[Surfels], stacks: list[DepthStack], tau: float, recoloured: float
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Per state (moved, static) [N] bool: tested against the *other* state's depth maps; the rest is unknown.
+
+    What the other state sees through has moved, and so has what has there in its place a surface of another colour (mean difference
+    of the channels above ``recoloured``).
+    """
     moved, static = [], []
     for s in (0, 1):
         free, on, _ = stacks[1 - s].counts(surfels[s].points, tau)
@@ -101,8 +107,13 @@ def evidence_masks(surfels: list[Surfels], stacks: list[DepthStack], tau: float)
         j = torch.from_numpy(np.asarray(j).reshape(len(surfels[s]), -1))
         d = torch.from_numpy(np.asarray(d).reshape(len(surfels[s]), -1))
         like = ((other.normals[j] * surfels[s].normals[:, None]).sum(2) > 0.7) & (d < 2 * max(surfels[0].spacing, surfels[1].spacing))
+        # where a door stood shut the open state is often rebuilt with a lid over the opening: the place is taken, the colour is not
+        near = still & like.any(1) & ~m
+        apart = (other.colours[j] - surfels[s].colours[:, None]).abs().mean(2)
+        other_colour = torch.where(like, apart, torch.full_like(apart, 9.0)).min(1).values > recoloured
+        m = m | (near & other_colour & smooth_mask(surfels[s].points, near & other_colour))
         moved.append(m)
-        static.append(still & like.any(1) & ~m)
+        static.append(near & ~other_colour & ~m)
     return moved, static
 
 
@@ -146,7 +157,7 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
     tau = 3 * noise + 0.2 * spacing
     noise = max(noise, disagreement(surfels, 0.025 * diag))
     scale = Scale(tau=tau, tp=config.tolerance * noise + 0.2 * spacing, spacing=spacing, diag=diag)
-    moved, static = evidence_masks(surfels, stacks, scale.tau)
+    moved, static = evidence_masks(surfels, stacks, scale.tau, config.recoloured)
     both = torch.cat([s.points for s in surfels])
     lo, hi = both.min(0).values - 0.04 * diag, both.max(0).values + 0.04 * diag
     landings = [Landing(surfels[s], static[s], stacks[s], lo, hi, scale) for s in (0, 1)]
