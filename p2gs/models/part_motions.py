@@ -38,7 +38,7 @@ class PartMotionsConfig:
     evidence_size: int = 200
     min_opacity: float = 0.5
     candidates: int = 3
-    compare_types_below: float = 20.0
+    compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
     part_penalty: float = 0.006
     same_motion: float = 0.04
@@ -267,23 +267,42 @@ def settle_types(
 ) -> PartMotions:
     """Fit both joint types where the angle leaves room for doubt, keep the one the images prefer; then refine with the types held."""
     level = config.coarse.levels[-1]
+
+    def cost(m: PartMotions) -> float:
+        return explanation_cost(states, m, views, level, backend, device)
+
+    best = None
     for k in range(len(motions)):
         angle = float(so3.rotation_angle(motions.transforms[k, :3, :3])) * 57.29578
         if motions.types[k] != "revolute" or angle >= config.compare_types_below:
             continue
-        slide = motions.transforms.clone()
-        own = states[0].gaussians.means[motions.labels[0] == k + 1].double()
-        centre = own.mean(0) if len(own) else torch.zeros(3).double()
-        slide[k] = torch.eye(4).double()
-        slide[k, :3, 3] = motions.transforms[k, :3, :3] @ centre + motions.transforms[k, :3, 3] - centre
-        types = [*motions.types[:k], "prismatic", *motions.types[k + 1 :]]
-        other = PartMotions(types, slide, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
+        best = cost(motions) if best is None else best
+        other = min(_as_slides(states, motions, k), key=cost)
         other = refine(states, other, views, config.coarse, stacks, seed=seed, backend=backend, device=device)
-        if explanation_cost(states, other, views, level, backend, device) <= explanation_cost(
-            states, motions, views, level, backend, device
-        ) * (1 + config.freedom_penalty):
-            motions = other
+        found = cost(other)
+        if found <= best * (1 + config.freedom_penalty):
+            motions, best = other, found
     return motions
+
+
+def _as_slides(states, motions: PartMotions, k: int) -> list[PartMotions]:
+    """The same with part k a slide that carries its middle where it goes, or as far as that is along the slide of another part."""
+    own = states[0].gaussians.means[motions.labels[0] == k + 1].double()
+    centre = own.mean(0) if len(own) else torch.zeros(3).double()
+    way = se3.apply(motions.transforms[k], centre[None])[0] - centre
+    ways = [way]
+    for i, kind in enumerate(motions.types):
+        if kind == "prismatic":
+            along = torch.nn.functional.normalize(motions.transforms[i, :3, 3], dim=0)
+            ways += [along * (way @ along), along * way.norm() * torch.sign(way @ along)]
+    out = []
+    for w in ways:
+        T = motions.transforms.clone()
+        T[k] = torch.eye(4).double()
+        T[k, :3, 3] = w
+        types = [*motions.types[:k], "prismatic", *motions.types[k + 1 :]]
+        out.append(PartMotions(types, T, motions.confidence, motions.labels, motions.margin, motions.diagnostics))
+    return out
 
 
 def _plain(value):
