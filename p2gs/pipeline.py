@@ -190,7 +190,7 @@ class Pipeline:
             found = self.cfg.phases["discovery"].config
             size = (found.evidence_size, found.min_opacity)
             train = [self.scene.select(state=s.state, split="train") for s in states]
-            seen = [gather_evidence(s.gaussians, v, *size, self.cfg.rasterizer, self.device) for s, v in zip(states, train)]
+            seen = [gather_evidence(s.gaussians, v, *size, self.cfg.rasterizer, self.device) for s, v in zip(states, train, strict=True)]
             stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in seen]
         return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, stacks=stacks, **self.common())
 

@@ -125,7 +125,8 @@ def fuse(g0: GaussianTensors, g1: GaussianTensors, motions: PartMotions | None, 
     p0, p1 = g0.means[solid[0]], g1.means[solid[1]]
     if min(len(p0), len(p1)) < 10:
         raise UserError(
-            f"canonical_fusion: only {min(len(p0), len(p1))} Gaussians of a state are opaque; expected an object (train single_state longer)"
+            f"canonical_fusion: only {min(len(p0), len(p1))} Gaussians of a state are opaque; expected an object "
+            "(train single_state longer)"
         )
     if config.fusion == "none":
         return _start_state_only(g0, motions)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews
 from p2gs.models.canonical import carry, with_static
+from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.joint_confidence import JointEvidence, measure_joints, measuring_level, state_depth
 from p2gs.models.joint_range import extend_ranges
@@ -117,7 +118,7 @@ def state_labels(learned: Articulation, labels: Tensor, state: StateGaussians, t
 def name_types(types: list[str], transforms: Tensor, below: float) -> list[str]:
     """Give every "free" motion a joint type by its angle."""
     angle = so3.rotation_angle(transforms[:, :3, :3]) * 57.29578 if len(transforms) else []
-    return [("prismatic" if float(a) < below else "revolute") if t == "free" else t for t, a in zip(types, angle)]
+    return [("prismatic" if float(a) < below else "revolute") if t == "free" else t for t, a in zip(types, angle, strict=True)]
 
 
 def constrain(kind: str, T: Tensor, centre: Tensor) -> Tensor:
@@ -187,7 +188,14 @@ def finish(
 
 
 def measure(
-    record: FinishRecord, states: list[StateGaussians], types: list[str], views: dict[int, TrainingViews], stacks, level: int, backend: str, device
+    record: FinishRecord,
+    states: list[StateGaussians],
+    types: list[str],
+    views: dict[int, TrainingViews],
+    stacks: list[DepthStack],
+    level: int,
+    backend: str,
+    device,
 ) -> None:
     """Fill in ``costs`` and ``evidence``. stacks: rendered depth of both states; level: image size."""
     options = {"level": level, "backend": backend, "device": device}

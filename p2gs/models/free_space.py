@@ -14,11 +14,13 @@ from p2gs.ops import se3
 
 
 @torch.no_grad()
-def explain_by_free_space(means: Tensor, labels: Tensor, transforms: Tensor, times: Tensor, stacks: list[DepthStack], tau: float) -> tuple[Tensor, Tensor]:
+def explain_by_free_space(
+    means: Tensor, labels: Tensor, transforms: Tensor, times: Tensor, stacks: list[DepthStack], tau: float
+) -> tuple[Tensor, Tensor]:
     """Labels that no state's depth contradicts, and which Gaussians to keep.
 
-    means [N, 3] at canonical time; labels [N]; transforms [K, 4, 4] start -> end, slot 0 included; times [K] canonical times; stacks: rendered
-    depth of the start and end reconstruction.  tau: tolerance along the ray (scene units).
+    means [N, 3] at canonical time; labels [N]; transforms [K, 4, 4] start -> end, slot 0 included; times [K] canonical times; stacks:
+    rendered depth of the start and end reconstruction.  tau: tolerance along the ray (scene units).
 
     A Gaussian is contradicted under a label when, carried to a state by that label's motion, most views see through it. One that
     its own label contradicts takes the uncontradicted label under which most views see it on a surface; where there is none it

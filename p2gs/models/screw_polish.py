@@ -42,7 +42,7 @@ class PolishConfig:
     free_moving: float = 0.05
 
     def level(self, fraction: float) -> int:
-        return [size for size, start in zip(self.levels, self.level_starts) if fraction >= start][-1]
+        return [size for size, start in zip(self.levels, self.level_starts, strict=False) if fraction >= start][-1]
 
 
 class MovedGaussians:

@@ -85,7 +85,7 @@ class ImagePhase(Phase):
         """Image size (long edge) at a step."""
         fraction = step / max(self.total_steps, 1)
         level = self.config.levels[0]
-        for size, start in zip(self.config.levels, self.config.level_starts):
+        for size, start in zip(self.config.levels, self.config.level_starts, strict=False):
             if fraction >= start:
                 level = size
         return level

@@ -184,7 +184,8 @@ def test_planar_against_its_slow_twin():
                     line = [(y + i * dy, x + i * dx) for i in range(2 * s + 1)]
                     if not all(inside[p] for p in line):
                         continue
-                    tv = sum(max((t.image[a] - t.image[b]).abs().mean().item() - loss.noise, 0) for a, b in zip(line, line[1:], strict=False))
+                    steps = [(t.image[a] - t.image[b]).abs().mean().item() for a, b in zip(line, line[1:], strict=False)]
+                    tv = sum(max(step - loss.noise, 0) for step in steps)
                     z = [depth[line[i]].item() for i in (0, s, 2 * s)]
                     w = math.exp(-tv / loss.contrast)
                     total += w * abs(1 / z[0] - 2 / z[1] + 1 / z[2]) * z[1] ** 2

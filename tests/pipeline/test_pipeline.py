@@ -26,7 +26,8 @@ phases:
     levels: [32, 64]
     level_starts: [0.0, 0.3]
     callbacks: {{densify: {{budget: 2000, every: 20}}}}
-  discovery: {{evidence_size: 64, candidates: 1, search: {{surfels: 4000, samples: 200}}, coarse: {{steps: 10, levels: [64], level_starts: [0.0]}}}}
+  discovery: {{evidence_size: 64, candidates: 1, search: {{surfels: 4000, samples: 200}},
+    coarse: {{steps: 10, levels: [64], level_starts: [0.0]}}}}
   canonical_fusion: {{steps: 12, levels: [64], level_starts: [0.0], canonical: {{match_size: 300}}}}
   articulation: {{steps: 12, levels: [64], level_starts: [0.0], refresh: 4}}
   finish: {{polish: {{steps: 8, levels: [64], level_starts: [0.0]}}}}
