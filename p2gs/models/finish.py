@@ -13,8 +13,8 @@ from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.joint_confidence import JointEvidence, measure_joints, measuring_level, state_depth
 from p2gs.models.joint_range import extend_ranges
-from p2gs.models.part_motions import refine, single_ways
 from p2gs.models.phase import PHASES
+from p2gs.models.refine_motions import leave_false_minima, refine, single_ways
 from p2gs.models.screw_polish import PolishConfig, photometric_cost
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
@@ -25,7 +25,8 @@ from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similari
 class FinishConfig:
     """Options of the last stage.
 
-    polish: photometric refinement of the screws with hard labels and frozen Gaussians.  min_mass: a slot with a smaller share of the
+    polish: photometric refinement of the screws with hard labels and frozen Gaussians.  survey: shifts of a part within its own surface
+    that are tried after it (internal units; [] = none).  min_mass: a slot with a smaller share of the
     solid Gaussians vanishes.  min_motion: likewise one that moves its points by less (internal units).  prismatic_below: a free motion
     (paper's start) that turns by less than this many degrees is a slide.  clean_neighbours: labels are the majority among this many
     neighbours at canonical time (0 = as learned).  exports: simulator formats written at the end of a fit, with meshes and report (empty:
@@ -34,6 +35,7 @@ class FinishConfig:
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.8))
+    survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     min_mass: float = 0.002
     min_motion: float = 0.01
     prismatic_below: float = 5.0
@@ -170,10 +172,12 @@ def finish(
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         level = min(measuring_level(views[s]) for s in (0, 1))
         stacks = [state_depth(state, views[s], level, backend=backend, device=device) for s, state in enumerate(states)]
-        refined = refine(states, motions, views, config.polish, stacks, seed=seed, backend=backend, device=device)
+        options = {"seed": seed, "backend": backend, "device": device}
+        refined = refine(states, motions, views, config.polish, stacks, **options)
+        refined, _ = leave_false_minima(states, refined, views, config.polish, stacks, config.survey, **options)
         transforms = refined.transforms
         record.after = transforms
-        record.polish = single_ways(states, refined, views, config.polish, stacks, seed=seed, backend=backend, device=device)
+        record.polish = single_ways(states, refined, views, config.polish, stacks, **options)
         measure(record, states, types, views, stacks, level, backend, device)
     parts = [Part(0, None, int((labels == 0).sum()))]
     for k, kind in enumerate(types):

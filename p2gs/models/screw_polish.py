@@ -40,6 +40,7 @@ class PolishConfig:
     min_opacity: float = 0.05
     free_static: float = 0.02
     free_moving: float = 0.05
+    front: float = 0.2
 
     def level(self, fraction: float) -> int:
         return [size for size, start in zip(self.levels, self.level_starts, strict=False) if fraction >= start][-1]
@@ -146,13 +147,15 @@ def apply_step(T: Tensor, centre: Tensor, radius: float, step: Tensor) -> Tensor
 class Side:
     """Frozen Gaussians of one state, labels [N] (part of each, -1 leaves it out) and the other state's photographs.
 
-    back: they are the end state's, carried to the start.
+    back: they are the end state's, carried to the start.  seen_from: mean direction [N, 3] to the cameras of their own state that see
+    each (``DepthStack.seen_from``); None: all views count.
     """
 
     gaussians: GaussianTensors
     labels: Tensor
     views: TrainingViews
     back: bool = False
+    seen_from: Tensor | None = None
 
 
 def polish(
@@ -176,10 +179,12 @@ def polish(
     transforms = transforms.double().clone()
     if config.steps <= 0 or len(transforms) == 0:
         return transforms, [float("nan")] * len(sides)
-    bodies = []
+    bodies, fronts = [], []
     for side in sides:
         solid = torch.sigmoid(side.gaussians.opacity_logits) > config.min_opacity
-        bodies.append(MovedGaussians(side.gaussians, torch.where(solid, side.labels, -1), device))
+        labels = torch.where(solid, side.labels, -1)
+        bodies.append(MovedGaussians(side.gaussians, labels, device))
+        fronts.append(None if side.seen_from is None else side.seen_from[labels >= 0].to(device))
     rows = [[body.rows(k + 1) for k in range(len(transforms))] for body in bodies]
     anchors, radius = _anchors(sides, bodies, rows, transforms)
     first, second = torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
@@ -206,7 +211,11 @@ def polish(
             if r.numel() < 10:
                 continue
             here = anchors[k] if side.back else se3.apply(transforms[k], anchors[k][None])[0]
-            at = means.detach()[r], quats.detach()[r], means.grad[r], quats.grad[r]
+            at = [means.detach()[r], quats.detach()[r], means.grad[r], quats.grad[r]]
+            if fronts[turn] is not None and config.front > -1:
+                T = transforms[k].T if side.back else transforms[k]  # of T^-1 only the rotation is asked for
+                front = facing(fronts[turn][r], T[:3, :3], at[0], shot.camera) >= config.front
+                at = [value[front] for value in at]
             rotation, translation = (v.cpu() for v in tangent_gradient(*at, here.to(means.device)))
             if side.back:
                 rotation, translation = (-transforms[k, :3, :3] @ v for v in (rotation, translation))
@@ -224,6 +233,15 @@ def polish(
         if kind == "revolute":
             transforms[k] = se3.project_revolute(transforms[k])  # what pitch the last steps left
     return transforms, [sum(of) / max(len(of), 1) for of in losses]
+
+
+def facing(seen_from: Tensor, rotation: Tensor, means: Tensor, camera: Camera) -> Tensor:
+    """Cosine [n] between the direction from moved points ``means`` [n, 3] to the camera and their turned ``seen_from`` [n, 3].
+
+    The back of a door's front face, seen through an opened door, stands a door's thickness before the inner face in the photograph.
+    """
+    way = torch.nn.functional.normalize(camera.position.to(means) - means, dim=1)
+    return ((seen_from @ rotation.T.to(means)) * way).sum(1)
 
 
 def _anchors(sides, bodies, rows, transforms: Tensor) -> tuple[list[Tensor], list[float]]:

@@ -8,7 +8,8 @@ from tiny import hinge, photographs, slide, textured_panels
 from p2gs.data.views import TrainingViews
 from p2gs.models.finish import FinishConfig, clean_labels, constrain, finish, majority, make_joint, name_types, surviving_slots
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
-from p2gs.models.part_motions import PartMotionsConfig, simplify, without_part
+from p2gs.models.part_choices import simplify, without_part
+from p2gs.models.part_motions import PartMotionsConfig
 from p2gs.models.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors, Similarity

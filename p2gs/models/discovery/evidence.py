@@ -106,6 +106,23 @@ class DepthStack:
             out[2, i : i + step] = behind.sum(1)
         return out[0], out[1], out[2]
 
+    def seen_from(self, points: Tensor, tau: float) -> Tensor:
+        """Mean direction [N, 3] (unit; 0 where no view sees it) from each point to the cameras that see it on a surface.
+
+        tau: tolerance along the ray, scene units.
+        """
+        views = torch.arange(len(self))
+        out = torch.zeros_like(points)
+        step = max(1, (1 << 20) // len(self))
+        near, far = self.near.reshape(-1), self.far.reshape(-1)
+        for i in range(0, len(points), step):
+            p = points[i : i + step]
+            z, index, inside = self.project(p, views)
+            on = inside & (z >= near[index] - tau) & (z <= far[index] + tau)
+            way = torch.nn.functional.normalize(self.position - p[:, None], dim=2)
+            out[i : i + step] = torch.where(on[..., None], way, torch.zeros_like(way)).sum(1)
+        return torch.nn.functional.normalize(out, dim=1)
+
     def excess(self, points: Tensor, tau: float, limit: float = 8.0) -> Tensor:
         """Mean over the views that see past a point of how far they do, in units of tau, at most ``limit``; 0 where none does. [N]"""
         views = torch.arange(len(self))

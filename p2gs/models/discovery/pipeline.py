@@ -22,6 +22,7 @@ from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
 from p2gs.models.discovery.rigid import Motions
 from p2gs.models.discovery.search import Search
 from p2gs.models.discovery.verify import image_score, violation
+from p2gs.ops import se3
 from p2gs.types import UserError
 
 
@@ -83,6 +84,7 @@ def discover(
     out = Discovery(
         motions=best.motions, surfels=best.surfels, probability=best.probability, score=best.score, value=best.value,
         labels_start=best.labels_start, labels_end=best.labels_end, candidates=candidates, diagnostics=figures | {"seconds": seconds},
+        problem=problem, graphs=graphs,
     )  # fmt: skip
     out.margin_start = best.label_points(start.points, start.colours, 0)[1]
     out.margin_end = best.label_points(end.points, end.colours, 1)[1]
@@ -97,6 +99,16 @@ def discover(
     ]
     lap("description", 1.0)
     return out
+
+
+def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate:
+    """The explanation by other motions: transforms [K, 4, 4] start -> end, types "revolute" | "prismatic". Every surfel chooses anew."""
+    screw = se3.screw_parameters(transforms.double())
+    turn = torch.tensor([t == "revolute" for t in types])
+    amount = torch.where(turn, screw.angle, screw.translation)
+    motions = Motions(turn, screw.axis.float(), screw.origin.float(), amount.float())
+    labelling = label(found.problem, motions, found.graphs)
+    return Candidate([], found.problem.surfels, labelling.probability, 0.0, 0.0)
 
 
 def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, fixed: bool, axes: Tensor) -> Explanation:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,7 +75,8 @@ class Discovery(Candidate):
 
     margin_start, margin_end [N]: confidence of the labels of the input points.  evidence_start, evidence_end [N] int: 1 moved,
     0 static, -1 unknown.  candidates: complete explanations, best first, this one included; one that
-    differs from the best by less than geometry can tell comes second.  diagnostics: each stage's own measure.
+    differs from the best by less than geometry can tell comes second.  diagnostics: each stage's own measure.  problem, graphs: what
+    was searched, for ``relabel``.
     """
 
     margin_start: Tensor = field(default_factory=lambda: torch.zeros(0))
@@ -83,3 +85,5 @@ class Discovery(Candidate):
     evidence_end: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
     candidates: list[Candidate] = field(default_factory=list)
     diagnostics: dict = field(default_factory=dict)
+    problem: Any = None
+    graphs: list = field(default_factory=list)

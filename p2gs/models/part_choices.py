@@ -1,0 +1,127 @@
+"""Which parts there are and how each may move: merge, drop, slide or turn, as the images decide."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.handover import PartMotions
+from p2gs.models.refine_motions import explanation_cost, refine
+from p2gs.ops import se3, so3
+from p2gs.ops.knn import knn
+
+if TYPE_CHECKING:
+    from p2gs.models.part_motions import PartMotionsConfig
+
+
+def simplify(
+    states, motions: PartMotions, views, config: PartMotionsConfig, *, backend: str, device="cpu", log: list[dict] | None = None
+) -> PartMotions:
+    """Make one of touching parts with one motion, and drop parts without which the images are explained as well.
+
+    log: told of each part that goes: what was done, its type, image loss with and without it, the loss that was allowed.
+    """
+    cost = explanation_cost(states, motions, views, config.coarse.levels[-1], backend, device)
+    tried: set[tuple] = set()
+    while len(motions):
+        found = None
+        for change, reduced in _reductions(states, motions, config.same_motion):
+            if change in tried:
+                continue
+            tried.add(change)
+            lower = explanation_cost(states, reduced, views, config.coarse.levels[-1], backend, device)
+            penalty = config.merge_penalty if change[0] == "merge" else config.part_penalty
+            if lower <= cost * (1 + penalty):
+                found = (reduced, lower)
+                if log is not None:
+                    gone = {"change": change[0], "type": motions.types[change[1]], "cost_with": cost, "cost_without": lower}
+                    log.append({**gone, "allowed": cost * (1 + penalty)})
+                break
+        if found is None:
+            return motions
+        motions, cost = found[0], min(cost, found[1])
+        tried.clear()
+    return motions
+
+
+def _reductions(states, motions: PartMotions, same_motion: float):
+    """Explanations with one part less: (what changed, motions). Merging comes first, small parts go before large ones."""
+    solid = [torch.sigmoid(s.gaussians.opacity_logits) > 0.5 for s in states]
+    points = [states[0].gaussians.means[solid[0] & (motions.labels[0] == k + 1)].double() for k in range(len(motions))]
+    order = sorted(range(len(motions)), key=lambda k: len(points[k]))
+    for i, small in enumerate(order):
+        for large in reversed(order[i + 1 :]):
+            if min(len(points[small]), len(points[large])) < 5:
+                continue
+            gap = se3.apply(motions.transforms[small], points[small]) - se3.apply(motions.transforms[large], points[small])
+            if float(gap.norm(dim=1).mean()) < same_motion and _touch(points[small], points[large]):
+                yield ("merge", small, large), without_part(motions, small, large + 1)
+    for small in order:
+        yield ("drop", small), without_part(motions, small, 0)
+
+
+def _touch(a: Tensor, b: Tensor) -> bool:
+    """Whether two point sets [N, 3], [M, 3] come as near to each other somewhere as the smaller one's points are to theirs."""
+    if len(a) > len(b):
+        a, b = b, a
+    spacing = knn(a, None, 1, True)[0].median()
+    return float(knn(b, a, 1, False)[0].quantile(0.02)) < 3 * float(spacing)
+
+
+def without_part(motions: PartMotions, index: int, into: int) -> PartMotions:
+    """The same motions without entry ``index``; its Gaussians get label ``into`` (numbered as before: 0 static, k + 1 for entry k)."""
+    keep = [k for k in range(len(motions)) if k != index]
+    renumber = torch.zeros(len(motions) + 1, dtype=torch.int64)
+    for new, old in enumerate(keep):
+        renumber[old + 1] = new + 1
+    renumber[index + 1] = renumber[into]
+    labels = [renumber[old] for old in motions.labels]
+    return PartMotions(
+        [motions.types[k] for k in keep], motions.transforms[keep], motions.confidence[keep], labels, motions.margin, motions.diagnostics
+    )
+
+
+def settle_types(
+    states, motions: PartMotions, views, config: PartMotionsConfig, stacks: list[DepthStack], *, seed: int, backend: str, device="cpu"
+) -> PartMotions:
+    """Fit both joint types where the angle leaves room for doubt, keep the one the images prefer; then refine with the types held."""
+    level = config.coarse.levels[-1]
+
+    def cost(m: PartMotions) -> float:
+        return explanation_cost(states, m, views, level, backend, device)
+
+    best = None
+    for k in range(len(motions)):
+        angle = float(so3.rotation_angle(motions.transforms[k, :3, :3])) * 57.29578
+        if motions.types[k] != "revolute" or angle >= config.compare_types_below:
+            continue
+        best = cost(motions) if best is None else best
+        other = min(_as_slides(states, motions, k), key=cost)
+        other = refine(states, other, views, config.coarse, stacks, seed=seed, backend=backend, device=device)
+        found = cost(other)
+        if found <= best * (1 + config.freedom_penalty):
+            motions, best = other, found
+    return motions
+
+
+def _as_slides(states, motions: PartMotions, k: int) -> list[PartMotions]:
+    """The same with part k a slide that carries its middle where it goes, or as far as that is along the slide of another part."""
+    own = states[0].gaussians.means[motions.labels[0] == k + 1].double()
+    centre = own.mean(0) if len(own) else torch.zeros(3).double()
+    way = se3.apply(motions.transforms[k], centre[None])[0] - centre
+    ways = [way]
+    for i, kind in enumerate(motions.types):
+        if kind == "prismatic":
+            along = torch.nn.functional.normalize(motions.transforms[i, :3, 3], dim=0)
+            ways += [along * (way @ along), along * way.norm() * torch.sign(way @ along)]
+    out = []
+    for w in ways:
+        T = motions.transforms.clone()
+        T[k] = torch.eye(4).double()
+        T[k, :3, 3] = w
+        types = [*motions.types[:k], "prismatic", *motions.types[k + 1 :]]
+        out.append(PartMotions(types, T, motions.confidence, motions.labels, motions.margin, motions.diagnostics))
+    return out

@@ -1,0 +1,125 @@
+"""Pieces of a part that hang apart from it, and shifted parts that cover themselves."""
+
+import pytest
+import torch
+from test_finish import two_states
+from tiny import hinge, look_at, slide
+
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.handover import PartMotions
+from p2gs.models.islands import find_islands, pieces, settle_islands
+from p2gs.models.refine_motions import leave_false_minima, survey
+from p2gs.models.screw_polish import PolishConfig, facing
+from p2gs.ops import se3
+from p2gs.types import GaussianTensors
+
+
+def sheet(corner, n=20, step=0.02):
+    """A square of n x n points in the plane x = corner[0]."""
+    y, z = torch.meshgrid(torch.arange(n) * step, torch.arange(n) * step, indexing="ij")
+    return torch.stack([torch.zeros(n * n), y.reshape(-1), z.reshape(-1)], 1) + torch.tensor(corner)
+
+
+def solid(points, opacity=0.9):
+    n = len(points)
+    quats = torch.zeros(n, 4)
+    quats[:, 0] = 1
+    return GaussianTensors(points, quats, torch.full((n, 3), -4.0), torch.logit(torch.full((n,), opacity)), torch.zeros(n, 1, 3))
+
+
+def push(x):
+    T = torch.eye(4, dtype=torch.float64)
+    T[0, 3] = x
+    return T
+
+
+def test_pieces_are_parted_by_labels_and_by_gaps():
+    points = torch.cat([sheet([0.0, 0, 0]), sheet([0.0, 0, 1.0])])
+    labels = torch.zeros(len(points), dtype=torch.int64)
+    assert len(pieces(points, labels).unique()) == 2
+    labels[:200] = 1  # one half of the first sheet
+    assert len(pieces(points, labels).unique()) == 3
+
+
+def test_only_small_pieces_of_moving_parts_are_islands():
+    points = torch.cat([sheet([0.0, 0, 0]), sheet([0.0, 0, 1.0], 5), sheet([0.0, 0, 2.0], 5)])
+    labels = torch.tensor([1] * 400 + [1] * 25 + [0] * 25)
+    found = find_islands(points, labels, 0.25) >= 0
+    assert found.tolist() == [False] * 400 + [True] * 25 + [False] * 25
+    assert not (find_islands(points, labels, 0.05) >= 0).any()
+
+
+def islands_case():
+    """Base, part 1 (sheet at z = 1), a patch amid the base that is labelled 1 in the end state alone."""
+    base, part = sheet([0.0, 0, 0]), sheet([0.0, 0, 1.0])
+    start = torch.cat([base, part])
+    end = torch.cat([base, part + torch.tensor([0.3, 0, 0])])
+    labels = torch.tensor([0] * 400 + [1] * 400)
+    wrong = labels.clone()
+    wrong[150:160] = 1
+    return [solid(start), solid(end)], labels, wrong, push(0.3)[None]
+
+
+def test_an_island_goes_to_what_it_touches():
+    states, labels, wrong, T = islands_case()
+    settled, count = settle_islands(states, [labels, wrong], T, 0.25)
+    assert count == [0, 10] and torch.equal(settled[1], labels) and torch.equal(settled[0], labels)
+    assert settle_islands(states, [labels, wrong], T, 0.0)[1] == [0, 0]
+
+
+def test_an_island_that_lands_on_its_part_stays():
+    """What the front hides in one state (a gap in the end's part) makes an island of its rest; the start shows that it is none."""
+    states, labels, _, T = islands_case()
+    gap = torch.ones(800, dtype=torch.bool)
+    gap[400 + 6 * 20 : 400 + 12 * 20] = False  # six rows of the end's part are not there
+    end = states[1][gap]
+    settled, count = settle_islands([states[0], end], [labels, labels[gap]], T, 0.9)
+    assert count == [0, 0] and torch.equal(settled[1], labels[gap])
+
+
+def test_faint_ones_go_with_their_surface():
+    states, labels, wrong, T = islands_case()
+    faint = states[1].means[155:156] + 0.001
+    end = GaussianTensors.cat([states[1], solid(faint, 0.05)])
+    settled, _ = settle_islands([states[0], end], [labels, torch.cat([wrong, torch.tensor([1])])], T, 0.25)
+    assert int(settled[1][-1]) == 0
+
+
+def test_seen_from_is_the_mean_direction_to_the_cameras_that_see_a_point():
+    eyes = [torch.tensor([3.0, 0.0, 0.0]), torch.tensor([2.4, 1.8, 0.0]), torch.tensor([-3.0, 0.0, 0.0])]
+    cameras = [look_at(e, 32) for e in eyes]
+    depths = [torch.full((32, 32), 3.0), torch.full((32, 32), 3.0), torch.full((32, 32), 2.0)]  # the third sees a wall before the point
+    stack = DepthStack(depths, [torch.ones(32, 32)] * 3, cameras)
+    found = stack.seen_from(torch.tensor([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]]), 0.02)
+    mean = (eyes[0] / 3 + eyes[1] / 3) / 2
+    assert torch.allclose(found[0], mean / mean.norm(), atol=1e-5) and found[1].abs().max() == 0
+
+
+def test_facing_turns_with_the_part():
+    camera = look_at(torch.tensor([3.0, 0.0, 0.0]), 32)
+    x, z = torch.tensor([[1.0, 0.0, 0.0]]), se3.from_screw(torch.tensor([0.0, 0, 1]), torch.zeros(3), torch.pi)[:3, :3]
+    assert float(facing(x, torch.eye(3), torch.zeros(1, 3), camera)) == pytest.approx(1.0)
+    assert float(facing(x, z, torch.zeros(1, 3), camera)) == pytest.approx(-1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind, truth", [("prismatic", slide()), ("revolute", hinge())])
+def test_survey_leaves_a_false_minimum(kind, truth):
+    states, labels, views = two_states(truth)
+    centre = se3.apply(truth, states[0].gaussians.means[labels == 1].double()).mean(0)
+    off = truth.clone()
+    points = se3.apply(truth, states[0].gaussians.means[labels == 1].double()) - centre
+    long = torch.linalg.svd(points, full_matrices=False)[2][0]
+    long = long - (se3.screw_parameters(truth).axis * (long @ se3.screw_parameters(truth).axis) if kind == "revolute" else 0)
+    off[:3, 3] += 0.12 * long / long.norm()
+    margins = [torch.ones(len(labels))] * 2
+    motions = PartMotions([kind], off[None], torch.ones(1), [labels, labels], margins)
+    assert survey(states, motions, views, 64, [], backend="auto")[1] == []
+    moved, which = survey(states, motions, views, 64, [0.06, 0.12], backend="auto")
+    error = [float((T[:3, 3] - truth[:3, 3]).norm()) for T in (off, moved.transforms[0])]
+    assert which == [0] and error[1] < 0.5 * error[0]
+    config = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0)
+    stacks = [None, None]  # not looked at: nothing is left out, all views count
+    config.front = -1.0
+    better, which = leave_false_minima(states, motions, views, config, stacks, [0.06, 0.12], seed=0, backend="auto")
+    assert which == [0] and float((better.transforms[0, :3, 3] - truth[:3, 3]).norm()) < 0.02
+    assert leave_false_minima(states, motions, views, config, stacks, [], seed=0, backend="auto") == (motions, [])
