@@ -14,6 +14,9 @@ from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.rigid import Motions
 
 
+REVEALED = 0.3  # cost of staying, of what has another colour than was there before: less than hiding (0.35), as it may have been behind
+
+
 class Graph:
     """k nearest neighbours as a sparse matrix [N, N], rows summing to 1; weights fall across creases, steps in colour and distance."""
 
@@ -47,6 +50,7 @@ def unary(problem: Problem, motions: Motions, state: int) -> Tensor:
     rest = torch.full((n,), 0.22)
     rest[static] = 0.02
     rest[moved] = 1.0
+    rest[problem.replaced[state]] = REVEALED
     columns = [rest]
     index = torch.arange(n)
     wanted = torch.zeros(n, dtype=torch.bool)

@@ -21,7 +21,7 @@ SOFT = 0.10
 
 @dataclass
 class Problem:
-    """surfels, stacks, landings, moved and static masks by state; ``samples``: indices of the moved surfels the search looks at.
+    """surfels, stacks, landings, moved, static and replaced masks by state; ``samples``: indices of the moved surfels the search looks at.
 
     trust [N] per state, 0.1..1: how credible it is that a moved surfel moved; ``weights`` [P] per state: that of the samples, sum 1.
     """
@@ -37,6 +37,7 @@ class Problem:
     weights: list[Tensor]
     trust: list[Tensor]
     centre: Tensor
+    replaced: list[Tensor]
 
     def points(self, state: int) -> Tensor:
         return self.surfels[state].points[self.samples[state]]
@@ -91,13 +92,14 @@ def smooth_mask(points: Tensor, mask: Tensor, k: int = 8) -> Tensor:
 
 def evidence_masks(
     surfels: list[Surfels], stacks: list[DepthStack], tau: float, recoloured: float
-) -> tuple[list[Tensor], list[Tensor]]:
-    """Per state (moved, static) [N] bool: tested against the *other* state's depth maps; the rest is unknown.
+) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    """Per state (moved, static, replaced) [N] bool: tested against the *other* state's depth maps; the rest is unknown.
 
     What the other state sees through has moved, and so has what has there in its place a surface of another colour (mean difference
-    of the channels above ``recoloured``).
+    of the channels above ``recoloured``): it is among the moved, and ``replaced``, as only one of the two need have moved; the other
+    was behind it.
     """
-    moved, static = [], []
+    moved, static, replaced = [], [], []
     for s in (0, 1):
         free, on, _ = stacks[1 - s].counts(surfels[s].points, tau)
         m, still = classify(free, on, need=min(3.0, max(1.0, len(stacks[1 - s]) / 8)))
@@ -111,10 +113,11 @@ def evidence_masks(
         near = still & like.any(1) & ~m
         apart = (other.colours[j] - surfels[s].colours[:, None]).abs().mean(2)
         other_colour = torch.where(like, apart, torch.full_like(apart, 9.0)).min(1).values > recoloured
-        m = m | (near & other_colour & smooth_mask(surfels[s].points, near & other_colour))
-        moved.append(m)
-        static.append(near & ~other_colour & ~m)
-    return moved, static
+        changed = near & other_colour & smooth_mask(surfels[s].points, near & other_colour)
+        moved.append(m | changed)
+        static.append(near & ~other_colour & ~moved[-1])
+        replaced.append(changed)
+    return moved, static, replaced
 
 
 def credibility(surfels: Surfels, other: Surfels, stack: DepthStack, moved: Tensor, scale: Scale) -> Tensor:
@@ -157,7 +160,7 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
     tau = 3 * noise + 0.2 * spacing
     noise = max(noise, disagreement(surfels, 0.025 * diag))
     scale = Scale(tau=tau, tp=config.tolerance * noise + 0.2 * spacing, spacing=spacing, diag=diag)
-    moved, static = evidence_masks(surfels, stacks, scale.tau, config.recoloured)
+    moved, static, replaced = evidence_masks(surfels, stacks, scale.tau, config.recoloured)
     both = torch.cat([s.points for s in surfels])
     lo, hi = both.min(0).values - 0.04 * diag, both.max(0).values + 0.04 * diag
     landings = [Landing(surfels[s], static[s], stacks[s], lo, hi, scale) for s in (0, 1)]
@@ -168,7 +171,7 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
         samples.append(index[spread_sample(surfels[s].points[index], config.samples, g)])
     trust = [credibility(surfels[s], surfels[1 - s], stacks[1 - s], moved[s], scale) for s in (0, 1)]
     weights = [trust[s][samples[s]] / trust[s][samples[s]].sum().clamp_min(1e-9) for s in (0, 1)]
-    problem = Problem(config, scale, stacks, surfels, moved, static, landings, samples, weights, trust, (lo + hi) / 2)
+    problem = Problem(config, scale, stacks, surfels, moved, static, landings, samples, weights, trust, (lo + hi) / 2, replaced)
     figures = {
         "diag": diag,
         "noise": noise,
