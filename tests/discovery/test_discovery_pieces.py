@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 import torch
 from boxes import both, door, drawer, shell
 
 from p2gs.models.discovery.config import DiscoveryConfig
 from p2gs.models.discovery.evidence import DepthStack, classify
 from p2gs.models.discovery.finish import Explanation
-from p2gs.models.discovery.labels import Labelling
-from p2gs.models.discovery.pipeline import ranked
-from p2gs.models.discovery.problem import build_problem
+from p2gs.models.discovery.labels import REVEALED, Labelling, unary
+from p2gs.models.discovery.pipeline import discover, ranked, relabel
+from p2gs.models.discovery.problem import build_problem, evidence_masks
 from p2gs.models.discovery.refine import pattern_search
 from p2gs.models.discovery.rigid import Motions
-from p2gs.models.discovery.surfels import window_planes
+from p2gs.models.discovery.surfels import Surfels, window_planes
 
 
 def counts_naive(stack: DepthStack, points, tau):
@@ -162,3 +163,30 @@ def test_pattern_search_climbs_to_the_top_of_a_known_gain():
     end, value = pattern_search(gain, start, 0.1, rounds=40, turn_radius=1.0)
     assert bool((value > before * 0.02).all()) and bool((value <= 0).all())
     torch.testing.assert_close(gain(end), value)
+
+
+def test_what_has_another_colour_in_its_place_has_changed_and_may_have_been_behind():
+    """A wall seen by both states, one half of it red in the start."""
+    (start, end), _ = both(shell(door(-0.6, 0.6, -0.6, 0.6, True, 50)), views=6, size=60, points=800)
+    stack = DepthStack(start.depths, start.alphas, start.cameras)
+    problem, _ = build_problem(start, start, DiscoveryConfig(), 0)  # nothing moves: the same state twice
+    wall = problem.surfels[0]
+    red = wall.points[:, 2] > wall.points[:, 2].median()
+    colours = torch.where(red[:, None], torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.4, 0.4, 0.4]))
+    walls = [Surfels(wall.points, wall.normals, c, wall.spacing, wall.noise) for c in (colours, torch.full_like(colours, 0.4))]
+    moved, static, replaced = evidence_masks(walls, [stack, stack], problem.scale.tau, 0.2)
+    for s in (0, 1):
+        assert torch.equal(moved[s], replaced[s]) and not (moved[s] & static[s]).any()
+        assert float(replaced[s][red].float().mean()) > 0.8 and float(replaced[s][~red].float().mean()) < 0.05
+    assert not any(m.any() for m in evidence_masks(walls, [stack, stack], problem.scale.tau, 0.7)[2])
+    problem.moved, problem.static, problem.replaced = moved, static, replaced
+    assert float(unary(problem, Motions.empty(), 0)[replaced[0], 0].max()) == pytest.approx(REVEALED)
+
+
+def test_relabel_by_the_true_motion_labels_like_the_search():
+    (start, end), truth = both(shell(door(-0.6, 0.6, -0.6, 0.6, True, 50)), views=12, size=80, points=2500)
+    found = discover(start, end, 2, seed=0)
+    assert len(found.motions) == 1
+    again = relabel(found, torch.stack([m.transform for m in found.motions]), [m.type for m in found.motions])
+    for s in (0, 1):
+        assert float((again.probability[s].argmax(1) == found.probability[s].argmax(1)).float().mean()) > 0.97

@@ -13,7 +13,6 @@ from torch import Tensor
 from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.rigid import Motions
 
-
 REVEALED = 0.3  # cost of staying, of what has another colour than was there before: less than hiding (0.35), as it may have been behind
 
 
