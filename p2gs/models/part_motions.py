@@ -105,6 +105,7 @@ def find_part_motions(
     motions = settle_types(states, motions, views, config, stacks, seed=seed, backend=backend, device=device)
     options = {"seed": seed, "backend": backend, "device": device}
     motions, shifted = leave_false_minima(states, motions, views, config.coarse, stacks, config.survey, **options)
+    say("settling labels and motions")
     motions, rounds = settle_labels(found, states, motions, views, config, stacks, seed=seed, backend=backend, device=device)
     motions.diagnostics = {
         "explanation": best[2],
