@@ -180,7 +180,8 @@ def test_what_has_another_colour_in_its_place_has_changed_and_may_have_been_behi
         assert float(replaced[s][red].float().mean()) > 0.8 and float(replaced[s][~red].float().mean()) < 0.05
     assert not any(m.any() for m in evidence_masks(walls, [stack, stack], problem.scale.tau, 0.7)[2])
     problem.moved, problem.static, problem.replaced = moved, static, replaced
-    assert float(unary(problem, Motions.empty(), 0)[replaced[0], 0].max()) == pytest.approx(REVEALED)
+    assert float(unary(problem, Motions.empty(), 0, revealed=True)[replaced[0], 0].max()) == pytest.approx(REVEALED)
+    assert float(unary(problem, Motions.empty(), 0)[replaced[0], 0].min()) == 1.0
 
 
 def test_relabel_by_the_true_motion_labels_like_the_search():

@@ -39,17 +39,19 @@ def softmax(x: Tensor) -> Tensor:
     return torch.softmax(x.T.contiguous(), 0).T.contiguous()
 
 
-def unary(problem: Problem, motions: Motions, state: int) -> Tensor:
+def unary(problem: Problem, motions: Motions, state: int, revealed: bool = False) -> Tensor:
     """Cost [N, K + 1] of every surfel of ``state`` under static (column 0) and each motion.
 
-    A surfel that a motion lays on a surface known to have moved is wanted there: that surface must come from somewhere.
+    A surfel that a motion lays on a surface known to have moved is wanted there: that surface must come from somewhere.  revealed: what has
+    another colour than was there before may have stayed, behind it (for known motions; while they are searched it must be accounted for).
     """
     n = len(problem.surfels[state])
     moved, static = problem.moved[state], problem.static[state]
     rest = torch.full((n,), 0.22)
     rest[static] = 0.02
     rest[moved] = 1.0
-    rest[problem.replaced[state]] = REVEALED
+    if revealed:
+        rest[problem.replaced[state]] = REVEALED
     columns = [rest]
     index = torch.arange(n)
     wanted = torch.zeros(n, dtype=torch.bool)
@@ -94,9 +96,9 @@ class Labelling:
         return top[:, 0] - top[:, 1]
 
 
-def label(problem: Problem, motions: Motions, graphs: list[Graph], agree: int = 2) -> Labelling:
+def label(problem: Problem, motions: Motions, graphs: list[Graph], agree: int = 2, revealed: bool = False) -> Labelling:
     """Label both states; after a first pass, points pay for landing on a surface that the other state labels differently."""
-    costs = [unary(problem, motions, s) for s in (0, 1)]
+    costs = [unary(problem, motions, s, revealed) for s in (0, 1)]
     p = [smooth_labels(costs[s], graphs[s]) for s in (0, 1)]
     for _ in range(agree):
         extra = []

@@ -107,7 +107,7 @@ def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate
     turn = torch.tensor([t == "revolute" for t in types])
     amount = torch.where(turn, screw.angle, screw.translation)
     motions = Motions(turn, screw.axis.float(), screw.origin.float(), amount.float())
-    labelling = label(found.problem, motions, found.graphs)
+    labelling = label(found.problem, motions, found.graphs, revealed=True)
     return Candidate([], found.problem.surfels, labelling.probability, 0.0, 0.0)
 
 
