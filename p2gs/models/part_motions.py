@@ -5,21 +5,21 @@ Not a training phase of the paper: its ancestors need hand-made part centres or 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
-from p2gs.models.discovery import Discovery, DiscoveryConfig, discover, relabel
+from p2gs.models.discovery import DiscoveryConfig, discover
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.islands import settle_islands
 from p2gs.models.part_choices import settle_types, simplify
 from p2gs.models.phase import PHASES
 from p2gs.models.refine_motions import explanation_cost, leave_false_minima, refine
 from p2gs.models.screw_polish import PolishConfig
+from p2gs.models.settle import label_gaussians, reconsider, settle_labels
 from p2gs.types import TwoStateScene, UserError
 
 
@@ -34,7 +34,8 @@ class PartMotionsConfig:
     same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one
     unless the image loss rises by more than this share.  survey: shifts within its own surface tried for each part (internal units;
     [] = none).  islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
-    surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.
+    surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.  reconsider: each part's motion is
+    searched once more amid the others, refined.
     """
 
     evidence_size: int = 200
@@ -48,6 +49,7 @@ class PartMotionsConfig:
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     islands: float = 0.25
     rounds: int = 2
+    reconsider: bool = True
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
 
@@ -104,9 +106,13 @@ def find_part_motions(
     motions = best[1]
     motions = settle_types(states, motions, views, config, stacks, seed=seed, backend=backend, device=device)
     options = {"seed": seed, "backend": backend, "device": device}
+    changed: list[dict] = []
     motions, shifted = leave_false_minima(states, motions, views, config.coarse, stacks, config.survey, **options)
+    if config.reconsider:
+        say("reconsidering each part")
+        motions, changed = reconsider(found, states, motions, views, config, stacks, **options)
     say("settling labels and motions")
-    motions, rounds = settle_labels(found, states, motions, views, config, stacks, seed=seed, backend=backend, device=device)
+    motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
     motions.diagnostics = {
         "explanation": best[2],
         "photometric_costs": costs,
@@ -114,6 +120,7 @@ def find_part_motions(
         "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],  # of the Gaussians above min_opacity
         "min_opacity": config.min_opacity,
         "shifted": shifted,
+        "reconsidered": changed,
         "rounds": rounds,
         **_plain(found.diagnostics),
     }
@@ -129,51 +136,8 @@ def _explanations(found) -> list:
     return [found, *[c for c in found.candidates if signature(c) != signature(found)]]
 
 
-def settle_labels(
-    found: Discovery, states, motions: PartMotions, views, config: PartMotionsConfig, stacks, *, seed: int, backend: str, device="cpu"
-) -> tuple[PartMotions, list[dict]]:
-    """With the refined motions every Gaussian chooses its part anew, islands are settled, motions refined again and types settled.
-
-    For ``rounds`` rounds, while the images are explained better. Returns the motions and what each round measured.
-    """
-    options = {"seed": seed, "backend": backend, "device": device}
-    level, rounds = config.coarse.levels[-1], []
-    cost = explanation_cost(states, motions, views, level, backend, device)
-    for number in range(config.rounds if len(motions) else 0):
-        best = None
-        # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from here on
-        for name in ("kept", "anew"):
-            tried = motions
-            if name == "anew":
-                labels, margin = _label_points(relabel(found, motions.transforms, motions.types), states)
-                tried = replace(motions, labels=labels, margin=margin)
-            labels, count = settle_islands([s.gaussians for s in states], tried.labels, tried.transforms, config.islands)
-            tried = refine(states, replace(tried, labels=labels), views, config.coarse, stacks, **options)
-            reached = explanation_cost(states, tried, views, level, backend, device)
-            rounds.append({"round": number, "labels": name, "islands": count, "before": cost, "after": reached})
-            if best is None or reached < best[0]:
-                best = (reached, tried)
-        if best[0] >= cost:
-            break
-        motions = settle_types(states, best[1], views, config, stacks, **options)
-        cost = explanation_cost(states, motions, views, level, backend, device)
-    return motions, rounds
-
-
-def _label_points(explanation, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
-    """Label and margin [N] of every Gaussian (also the faint ones) of both states."""
-    from p2gs.ops.sh import dc_to_rgb
-
-    labels, margin = [], []
-    for state, s in enumerate(states):
-        lab, mar = explanation.label_points(s.gaussians.means, dc_to_rgb(s.gaussians.sh[:, 0]).clamp(0, 1), state)
-        labels.append(torch.as_tensor(lab, dtype=torch.int64))
-        margin.append(torch.as_tensor(mar, dtype=torch.float32))
-    return labels, margin
-
-
 def _label_states(explanation, states: list[StateGaussians]) -> PartMotions:
-    labels, margin = _label_points(explanation, states)
+    labels, margin = label_gaussians(explanation, states)
     types = [m.type for m in explanation.motions]
     transforms = (
         torch.stack([torch.as_tensor(m.transform, dtype=torch.float64) for m in explanation.motions])

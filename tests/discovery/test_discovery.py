@@ -7,7 +7,7 @@ import pytest
 import torch
 from boxes import PLAIN, both, box, door, drawer, shell
 
-from p2gs.models.discovery import DiscoveryConfig, StateEvidence, discover
+from p2gs.models.discovery import DiscoveryConfig, StateEvidence, discover, instead_of
 from p2gs.types import UserError
 
 SMALL = DiscoveryConfig(surfels=4000, samples=250, candidates=2)
@@ -66,6 +66,19 @@ def test_door_and_drawer(door_and_drawer):
     assert len(found.motions) == 2
     assert min(label_accuracy(found, match(found, obj), truth)) > 0.9
     assert all(0 < m.confidence <= 1 for m in found.motions) and sum(m.mass for m in found.motions) > 0.8
+
+
+def test_a_wrong_motion_amid_right_ones_is_asked_for_anew(door_and_drawer):
+    obj, _, _, found = door_and_drawer
+    door_k, drawer_k = match(found, obj)
+    truth = torch.as_tensor(obj.parts[2].pose(1.0) @ np.linalg.inv(obj.parts[2].pose(0.0)))
+    T, types = torch.stack([m.transform for m in found.motions]), [m.type for m in found.motions]
+    T[drawer_k], types[drawer_k] = T[door_k] @ T[door_k], "revolute"
+    (best, kind), *_ = instead_of(found, T, types, drawer_k)
+    assert kind == "prismatic" and float((best[:3, 3] - truth[:3, 3]).norm()) < 0.1  # before it is refined
+    # the part's own motion is no other motion
+    T[drawer_k], types[drawer_k] = truth, "prismatic"
+    assert all(float((A - truth).abs().max()) > 0.03 for A, _ in instead_of(found, T, types, drawer_k))
 
 
 def test_label_points_agrees_with_labels_and_is_unsure_far_away(door_and_drawer):

@@ -57,6 +57,7 @@ def discover(
     lap("evidence", 0.2)
     graphs = [Graph(s.points, s.normals, s.colours) for s in problem.surfels]
     explanations: list[Explanation] = []
+    search = None
     if limit > 0 and max(map(len, problem.samples)) >= config.min_moved and min(map(len, problem.samples)) >= 3:
         axes = directions(problem)
         swept = sweep(problem, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in problem.samples])
@@ -84,7 +85,7 @@ def discover(
     out = Discovery(
         motions=best.motions, surfels=best.surfels, probability=best.probability, score=best.score, value=best.value,
         labels_start=best.labels_start, labels_end=best.labels_end, candidates=candidates, diagnostics=figures | {"seconds": seconds},
-        problem=problem, graphs=graphs,
+        problem=problem, graphs=graphs, search=search,
     )  # fmt: skip
     out.margin_start = best.label_points(start.points, start.colours, 0)[1]
     out.margin_end = best.label_points(end.points, end.colours, 1)[1]
@@ -103,12 +104,35 @@ def discover(
 
 def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate:
     """The explanation by other motions: transforms [K, 4, 4] start -> end, types "revolute" | "prismatic". Every surfel chooses anew."""
+    labelling = label(found.problem, as_motions(transforms, types), found.graphs, revealed=True)
+    return Candidate([], found.problem.surfels, labelling.probability, 0.0, 0.0)
+
+
+def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int, count: int = 3) -> list[tuple[Tensor, str]]:
+    """Motions [4, 4] that best explain what all parts but ``part`` leave over, and their types: best first, without the part's own.
+
+    The search fits all parts to one another's remains while all are rough; with the others refined the same evidence can say more.
+    """
+    search, own = found.search, as_motions(transforms, types)
+    if search is None:
+        return []
+    rest = search.pool.add(own[torch.tensor([k for k in range(len(types)) if k != part], dtype=torch.long)]).tolist()
+    motions, _ = search.propose(rest, 96, 12)
+    if not len(motions):
+        return []
+    index = search.pool.add(motions).tolist()
+    best = sorted(range(len(index)), key=lambda i: search.value([*rest, index[i]]), reverse=True)
+    far = own[part : part + 1].swept(search.probe, motions)[0] > search.radius
+    picked = [i for i in best if far[i]][:count]
+    return [(motions.transform(i), "revolute" if bool(motions.turn[i]) else "prismatic") for i in picked]
+
+
+def as_motions(transforms: Tensor, types: list[str]) -> Motions:
+    """Motions [K] of transforms [K, 4, 4] start -> end of types "revolute" | "prismatic"."""
     screw = se3.screw_parameters(transforms.double())
     turn = torch.tensor([t == "revolute" for t in types])
     amount = torch.where(turn, screw.angle, screw.translation)
-    motions = Motions(turn, screw.axis.float(), screw.origin.float(), amount.float())
-    labelling = label(found.problem, motions, found.graphs, revealed=True)
-    return Candidate([], found.problem.surfels, labelling.probability, 0.0, 0.0)
+    return Motions(turn, screw.axis.float(), screw.origin.float(), amount.float())
 
 
 def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, fixed: bool, axes: Tensor) -> Explanation:

@@ -1,0 +1,105 @@
+"""With refined motions: what each part's motion should be amid the others, and which Gaussians belong to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from p2gs.models.discovery import Candidate, Discovery, instead_of, relabel
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.handover import PartMotions, StateGaussians
+from p2gs.models.islands import settle_islands
+from p2gs.models.part_choices import settle_types
+from p2gs.models.refine_motions import explanation_cost, refine
+from p2gs.ops.sh import dc_to_rgb
+
+if TYPE_CHECKING:
+    from p2gs.models.part_motions import PartMotionsConfig
+
+
+def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
+    """Label and margin [N] of every Gaussian (also the faint ones) of both states."""
+    labels, margin = [], []
+    for state, s in enumerate(states):
+        lab, mar = explanation.label_points(s.gaussians.means, dc_to_rgb(s.gaussians.sh[:, 0]).clamp(0, 1), state)
+        labels.append(torch.as_tensor(lab, dtype=torch.int64))
+        margin.append(torch.as_tensor(mar, dtype=torch.float32))
+    return labels, margin
+
+
+def reconsider(
+    found: Discovery,
+    states,
+    motions: PartMotions,
+    views,
+    config: PartMotionsConfig,
+    stacks: list[DepthStack],
+    *,
+    seed: int,
+    backend: str,
+    device="cpu",
+) -> tuple[PartMotions, list[dict]]:
+    """Exchange motions for others that explain what the refined rest leaves over, while the photographs agree.
+
+    For each part the search proposes other motions (``instead_of``); with each every surfel chooses its part anew and the states are
+    re-rendered; the best of all is refined and kept if the image loss falls by ``freedom_penalty``.  Returns the motions and
+    what was tried.
+    """
+    options = {"backend": backend, "device": device}
+    level, log = config.coarse.levels[-1], []
+    cost = explanation_cost(states, motions, views, level, **options)
+    for _ in range(len(motions)):
+        best = None
+        for part in range(len(motions)):
+            for transform, kind in instead_of(found, motions.transforms, motions.types, part):
+                transforms = motions.transforms.clone()
+                transforms[part] = transform
+                types = [*motions.types[:part], kind, *motions.types[part + 1 :]]
+                labels, margin = label_gaussians(relabel(found, transforms, types), states)
+                tried = replace(motions, types=types, transforms=transforms, labels=labels, margin=margin)
+                reached = explanation_cost(states, tried, views, level, **options)
+                if best is None or reached < best[0]:
+                    best = (reached, part, tried)
+        if best is None:
+            break
+        refined = refine(states, best[2], views, config.coarse, stacks, seed=seed, **options)
+        reached = explanation_cost(states, refined, views, level, **options)
+        log.append({"part": best[1], "type": best[2].types[best[1]], "before": cost, "tried": best[0], "after": reached})
+        if reached >= cost * (1 - config.freedom_penalty):
+            break
+        motions, cost = refined, reached
+    return motions, log
+
+
+def settle_labels(
+    found: Discovery, states, motions: PartMotions, views, config: PartMotionsConfig, stacks, *, seed: int, backend: str, device="cpu"
+) -> tuple[PartMotions, list[dict]]:
+    """With the refined motions every Gaussian chooses its part anew, islands are settled, motions refined again and types settled.
+
+    For ``rounds`` rounds, while the images are explained better. Returns the motions and what each round measured.
+    """
+    options = {"seed": seed, "backend": backend, "device": device}
+    level, rounds = config.coarse.levels[-1], []
+    cost = explanation_cost(states, motions, views, level, backend, device)
+    for number in range(config.rounds if len(motions) else 0):
+        best = None
+        # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from here on
+        for name in ("kept", "anew"):
+            tried = motions
+            if name == "anew":
+                labels, margin = label_gaussians(relabel(found, motions.transforms, motions.types), states)
+                tried = replace(motions, labels=labels, margin=margin)
+            labels, count = settle_islands([s.gaussians for s in states], tried.labels, tried.transforms, config.islands)
+            tried = refine(states, replace(tried, labels=labels), views, config.coarse, stacks, **options)
+            reached = explanation_cost(states, tried, views, level, backend, device)
+            rounds.append({"round": number, "labels": name, "islands": count, "before": cost, "after": reached})
+            if best is None or reached < best[0]:
+                best = (reached, tried)
+        if best[0] >= cost:
+            break
+        motions = settle_types(states, best[1], views, config, stacks, **options)
+        cost = explanation_cost(states, motions, views, level, backend, device)
+    return motions, rounds

@@ -1,0 +1,48 @@
+"""A part whose motion was fitted to the others' remains is asked for once more, and the photographs decide."""
+
+import pytest
+import torch
+from test_finish import two_states
+from tiny import hinge, slide
+
+from p2gs.models import settle
+from p2gs.models.handover import PartMotions
+from p2gs.models.part_motions import PartMotionsConfig
+from p2gs.models.screw_polish import PolishConfig
+from p2gs.ops import se3
+
+COARSE = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0)
+
+
+@pytest.fixture
+def scene(monkeypatch):
+    """A slide of one panel; labels are known, what the search would propose is told by the test."""
+    states, labels, views = two_states(slide())
+    margins = [torch.ones(len(labels))] * 2
+    monkeypatch.setattr(settle, "relabel", lambda *a: None)
+    monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
+
+    def reconsider(kind, T, proposed):
+        monkeypatch.setattr(settle, "instead_of", lambda *a: proposed)
+        motions = PartMotions([kind], T[None], torch.ones(1), [labels, labels], margins)
+        config = PartMotionsConfig(coarse=COARSE)
+        return motions, *settle.reconsider(None, states, motions, views, config, [None, None], seed=0, backend="auto")
+
+    return reconsider
+
+
+def test_a_wrong_motion_is_exchanged_for_a_proposed_one_that_is_refined(scene):
+    near = slide()
+    near[:3, 3] += torch.tensor([0.02, -0.02, 0.02])
+    wrong = se3.from_screw(torch.tensor([0.0, 0, 1]).double(), torch.tensor([-0.4, 0.5, 0]).double(), -1.1)
+    _, found, log = scene("revolute", wrong, [(hinge(), "revolute"), (near, "prismatic")])
+    assert found.types == ["prismatic"] and log[0]["type"] == "prismatic"
+    assert float((found.transforms[0] - slide()).norm()) < 0.01  # refined, from 0.035
+    assert log[0]["after"] < log[0]["tried"] < log[0]["before"]
+
+
+def test_a_right_motion_stays(scene):
+    motions, found, log = scene("prismatic", slide(), [(hinge(), "revolute")])
+    assert found is motions and len(log) == 1 and log[0]["after"] > log[0]["before"]
+    motions, found, log = scene("prismatic", slide(), [])
+    assert found is motions and log == []
