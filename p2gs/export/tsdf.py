@@ -179,6 +179,7 @@ class ActiveGrid:
     def surface(self, field: Tensor, seen: Tensor, colour: Tensor) -> Mesh:
         """Zero crossing of field [M] over the cells whose eight corners are seen [M]; colours [M, 3] in 0..1 carried along."""
         from scipy.ndimage import map_coordinates
+        from scipy.spatial import cKDTree
         from skimage.measure import marching_cubes
 
         i = tuple(self.index[seen].T.numpy())
@@ -203,7 +204,10 @@ class ActiveGrid:
             volume = np.zeros(self.shape, np.float32)
             volume[i] = colour[seen, c].numpy() if c < 3 else 1.0
             rgb[:, c] = map_coordinates(volume, vertices.T, order=1, mode="nearest")
+        painted = rgb[:, 3] > 1e-6  # not where pinholes were filled
         rgb = rgb[:, :3] / np.maximum(rgb[:, 3:], 1e-6)
+        if painted.any() and not painted.all():
+            rgb[~painted] = rgb[painted][cKDTree(vertices[painted]).query(vertices[~painted])[1]]
         world = self.origin.numpy() + vertices.astype(np.float64) * self.voxel
         return Mesh(world, faces.astype(np.int64), (np.clip(rgb, 0, 1) * 255).round().astype(np.uint8))
 

@@ -1,0 +1,88 @@
+"""Sides of a mesh that no camera saw: what stands on the floor has an underside, though no photograph shows it.
+
+A mesh from photographs is open where nobody looked. A side of its bounding box is closed by a plane where space just inside was never seen
+to be empty, no surface was seen near, and what was seen of the object reaches down to that plane around it.
+"""
+
+from __future__ import annotations
+
+from typing import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from p2gs.export.tsdf import DepthView, Mesh, seen_points
+
+STEP, NEAR = 2.0, 4.0  # voxels: between a plane's vertices; a seen surface nearer than this is the side itself
+LEAST = 0.2  # share of a side of the box that must be unseen for it to be closed
+RIM = 0.5  # share of the unseen area's rim that must touch seen surface
+
+
+def seen_empty(points: Tensor, views: Sequence[DepthView], poses: Sequence[Tensor], clearance: float) -> Tensor:
+    """[n] whether some view sees surface further than ``clearance`` behind a point, or nothing. points [n, 3] float64, start-state
+    coordinates of the part that ``poses`` (start-state coordinates -> world, [4, 4] a view) carry."""
+    empty = torch.zeros(len(points), dtype=torch.bool)
+    for view, T in zip(views, poses, strict=True):
+        M = (view.camera.K.double() @ (view.camera.viewmat.double() @ T)[:3]).to(points)
+        p = points @ M[:, :3].T + M[:, 3]
+        z = p[:, 2]
+        height, width = view.depth.shape
+        u, v = (p[:, :2] / z.clamp_min(1e-6)[:, None]).T
+        inside = (z > 1e-4) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        pixel = v.clamp(0, height - 1).long() * width + u.clamp(0, width - 1).long()
+        depth = torch.where(view.labels < 0, torch.full_like(view.depth, 1e9), view.depth).reshape(-1)[pixel]
+        empty |= inside & (depth - z > clearance)
+    return empty
+
+
+def unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, clearance: float) -> Mesh:
+    """Planes on the unseen sides of the part's box, coloured as the seen surface nearest to them; empty where every side is seen.
+
+    mesh, poses: start-state coordinates of the part (its number in ``views``).  voxel: of the mesh.  clearance: as in ``seen_empty``.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(mesh.faces) == 0:
+        return Mesh.empty()
+    # the mesh goes on for a voxel or two beyond the edges of what was seen
+    seen = torch.cat([seen_points(v, part, T, stride=2) for v, T in zip(views, poses, strict=True)]).numpy()
+    lo, hi = np.quantile(seen, 0.002, axis=0), np.quantile(seen, 0.998, axis=0)
+    tree, planes = cKDTree(mesh.vertices), []
+    for axis in range(3):
+        across = [i for i in range(3) if i != axis]
+        shape = [max(2, round((hi[i] - lo[i]) / (STEP * voxel)) + 1) for i in across]
+        grid = np.meshgrid(*(np.linspace(lo[i], hi[i], n) for i, n in zip(across, shape, strict=True)), indexing="ij")
+        for at, outward in ((lo[axis], -1.0), (hi[axis], 1.0)):
+            points = np.full((grid[0].size, 3), at)
+            points[:, across] = np.stack([g.ravel() for g in grid], 1)
+            within = points.copy()
+            within[:, axis] -= outward * voxel
+            solid = ~seen_empty(torch.as_tensor(within), views, poses, clearance).numpy()
+            distance, nearest = tree.query(points)
+            if (solid & (distance > NEAR * voxel)).mean() < LEAST:
+                continue
+            area = solid.reshape(shape)
+            if _touching(area, (distance < NEAR * voxel).reshape(shape)) >= RIM:
+                planes.append(_plane(points, area, mesh.colours[nearest], outward * (-1) ** axis))
+    return Mesh.join(planes) if planes else Mesh.empty()
+
+
+def _touching(area: np.ndarray, seen: np.ndarray) -> float:
+    """Share of the rim of an area [a, b] bool at or beside which there is seen surface [a, b] bool."""
+    from scipy.ndimage import binary_dilation, binary_erosion
+
+    rim = area & ~binary_erosion(area)
+    return float(binary_dilation(seen)[rim].mean()) if rim.any() else 0.0
+
+
+def _plane(points: np.ndarray, area: np.ndarray, colours: np.ndarray, sign: float) -> Mesh:
+    """Two triangles for each grid cell whose corners are all in ``area`` [a, b]; points, colours [a b, 3]. sign: which way it faces."""
+    index = np.arange(area.size).reshape(area.shape)
+    i, j = np.nonzero(area[:-1, :-1] & area[1:, :-1] & area[:-1, 1:] & area[1:, 1:])
+    corners = [index[i, j], index[i + 1, j], index[i + 1, j + 1], index[i, j + 1]]
+    if sign < 0:
+        corners = corners[::-1]
+    faces = np.concatenate([np.stack([corners[k] for k in t], 1) for t in ((0, 1, 2), (0, 2, 3))])
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return Mesh(points[used], renumbered.reshape(-1, 3), colours[used])

@@ -1,0 +1,90 @@
+"""Undersides that no camera saw are closed; what cameras see into or around is left as it was seen."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from toy import ring
+
+from p2gs.data.furniture import box
+from p2gs.data.raytrace import trace
+from p2gs.data.textures import Texture
+from p2gs.export.tsdf import DepthView, Mesh, add_normals, fuse
+from p2gs.export.unseen import seen_empty, unseen_sides
+
+EYE = torch.eye(4, dtype=torch.float64)
+VOXEL = 0.03
+PLAIN = Texture("noise", (0.6, 0.6, 0.6), (0.5, 0.5, 0.5), 0.2, 1)
+
+
+def boards(*corners):
+    return [box(a, b, PLAIN) for a, b in corners]
+
+
+BLOCK = boards(((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3)))
+# an open box that stands on its side, its mouth to +x: its floor is seen from within
+CRATE = boards(
+    ((-0.5, -0.4, -0.3), (-0.46, 0.4, 0.3)),
+    ((-0.5, -0.4, -0.3), (0.5, -0.36, 0.3)),
+    ((-0.5, 0.36, -0.3), (0.5, 0.4, 0.3)),
+    ((-0.5, -0.4, -0.3), (0.5, 0.4, -0.26)),
+    ((-0.5, -0.4, 0.26), (0.5, 0.4, 0.3)),
+)
+# a table: space between its legs is seen, and its legs are no rim
+TABLE = boards(
+    ((-0.5, -0.4, 0.1), (0.5, 0.4, 0.15)),
+    *(((x, y, -0.3), (x + 0.1, y + 0.1, 0.1)) for x in (-0.5, 0.4) for y in (-0.4, 0.3)),
+)
+
+
+def look(primitives, cameras):
+    views = []
+    for c in cameras:
+        K, axis = c.K.double().numpy(), (np.arange(c.width) + 0.5 - c.width / 2) / float(c.K[0, 0])
+        z, _ = trace(primitives, c.viewmat.double().numpy(), K, axis, axis)
+        hit = torch.from_numpy(np.isfinite(z))
+        depth = torch.where(hit, torch.from_numpy(z), torch.zeros(z.shape))
+        views.append(add_normals(DepthView(c, depth, torch.where(hit, 0, -1), torch.full((*z.shape, 3), 0.5)), 2 * VOXEL))
+    return views
+
+
+def closed(primitives, elevations=(15.0, 40.0)):
+    views = look(primitives, ring(12, 160, elevations=elevations))
+    poses = [EYE] * len(views)
+    mesh = fuse(views, poses, 0, VOXEL, 4 * VOXEL, 2 * VOXEL)
+    return mesh, unseen_sides(mesh, views, poses, 0, VOXEL, 4 * VOXEL)
+
+
+def test_an_underside_that_no_camera_saw_is_closed():
+    mesh, plane = closed(BLOCK)
+    assert np.allclose(plane.vertices[:, 2], -0.3, atol=VOXEL)
+    sheet = trimesh.Trimesh(plane.vertices, plane.faces, process=False)
+    assert sheet.area == pytest.approx(0.8, rel=0.15) and (sheet.face_normals[:, 2] < -0.99).all()
+    assert np.abs(plane.colours.astype(int) - 128).max() < 3
+
+
+def test_a_closed_block_has_its_volume():
+    mesh, plane = closed(BLOCK)
+    whole = Mesh.join([mesh, plane])
+    assert trimesh.Trimesh(whole.vertices, whole.faces, process=False).volume == pytest.approx(0.48, rel=0.06)
+
+
+def test_what_is_seen_is_left_alone():
+    assert len(closed(BLOCK, (15.0, 40.0, -30.0))[1].faces) == 0
+    for primitives in (CRATE, TABLE):
+        mesh, plane = closed(primitives)
+        assert len(mesh.faces) and len(plane.faces) == 0
+    assert len(unseen_sides(Mesh.empty(), [], [], 0, VOXEL, 4 * VOXEL).faces) == 0
+
+
+def test_seen_empty_tells_what_is_before_and_behind():
+    (view,) = look(BLOCK, ring(1, 160, elevations=(0.0,)))
+    toward = view.camera.position.double()[None] / float(view.camera.position.norm())
+    points = torch.cat([1.2 * toward, 0.0 * toward, -1.2 * toward, torch.tensor([[0, 0, 9.0]])])
+    # before the block; inside it; behind it; outside the picture
+    assert seen_empty(points, [view], [EYE], 0.1).tolist() == [True, False, False, False]
+    T = EYE.clone()
+    T[2, 3] = 5.0 * math.sqrt(2)
+    assert seen_empty(points, [view], [T], 0.1).tolist() == [False] * 4  # carried out of the picture
