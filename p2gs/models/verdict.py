@@ -14,7 +14,7 @@ LIMITS = {
     "ambiguous": (0.4, "share of a part's Gaussians with unclear labels"),
     "matched": (0.05, "share of a part's fused Gaussians with a partner in the other state"),
     "removed": (0.15, "share of the fused Gaussians that free space contradicted"),
-    "learning": (1.03, "image loss after the articulation phase, as a multiple of that before"),
+    "learning": (1.25, "image loss after the articulation phase, as a multiple of that before"),
     "changed_degrees": (2.0, "degrees that the last polish turned a joint: it started far from where it ended"),
     "disagreement": (1.0, "per cent of the object's diagonal between the two directions of the last polish"),
     "contradicted": (0.1, "share of a part that lands where the other state is seen to be empty"),
@@ -22,7 +22,8 @@ LIMITS = {
     "residual": (4.0, "image residual of a moved part, as a multiple of the static part's"),
     "rise": (0.005, "growth of the residual when a part is displaced by 1 % of the diagonal: below, images do not hold the joint"),
     "fall": (0.03, "share by which a small change of the joint lowers the residual: the joint is not at its best place"),
-    "confidence": (0.3, "confidence below which a joint should not be used"),
+    "confidence": (0.1, "confidence below which a joint should not be used"),
+    "sure": (0.3, "confidence below which a joint deserves a look at its pictures"),
 }
 STAGES = ("single_state", "discovery", "canonical_fusion", "articulation", "finish")
 
@@ -169,5 +170,6 @@ def _joints(d: dict, say, diagonal: float) -> None:
             if "discovery" in earlier:
                 text += f"; discovery handed it over with {earlier['discovery']:.2f}, articulation with {earlier['articulation']:.2f}"
             say(next(s for s, c in earlier.items() if c < limit("confidence")), text + ".")
-        elif reasons:
-            say("finish", f"{name} ({j['type']}): {'; '.join(reasons)} (confidence {j['confidence']:.2f}).", "note")
+        elif reasons or j["confidence"] < limit("sure"):
+            why = "; ".join(reasons) or "several measures are middling"
+            say("finish", f"{name} ({j['type']}): {why} (confidence {j['confidence']:.2f}).", "note")

@@ -113,10 +113,13 @@ def test_each_rule_speaks_for_its_stage(right, stage, change, word):
 def test_directions_that_disagree_are_told_in_degrees(right):
     d = json.loads(json.dumps(right))
     d["polish"]["joints"][0] |= {"disagreement": 0.05, "disagreement_degrees": 3.1}
-    d["joints"][0]["confidence"] = d["joints"][0]["confidence_by_stage"]["finish"] = 0.1
+    d["joints"][0]["confidence"] = d["joints"][0]["confidence_by_stage"]["finish"] = 0.05
     (text,) = texts(d)
     assert "forward and backward polish disagree by 3.1 deg" in text and "its motion is not reliable" in text
     assert lost_at(verdicts(d, 1.0)) == "finish"
+    d["joints"][0]["confidence"] = 0.2  # not sure, but no loss
+    (said,) = [v for v in verdicts(d, 1.0) if "polish disagree" in v["text"]]
+    assert said["level"] == "note" and lost_at(verdicts(d, 1.0)) is None
 
 
 def test_both_files_are_the_same_when_written_again(tmp_path):
