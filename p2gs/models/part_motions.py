@@ -34,8 +34,8 @@ class PartMotionsConfig:
     same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one
     unless the image loss rises by more than this share.  survey: shifts within its own surface tried for each part (internal units;
     [] = none).  islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
-    surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.  reconsider: each part's motion is
-    searched once more amid the others, refined.
+    surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.  reconsider: each part's motion, and
+    one more, is searched again amid the others, refined; missing_penalty: relative image loss by which a part that comes so must win.
     """
 
     evidence_size: int = 200
@@ -50,6 +50,7 @@ class PartMotionsConfig:
     islands: float = 0.25
     rounds: int = 2
     reconsider: bool = True
+    missing_penalty: float = 0.1
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
 
@@ -110,7 +111,8 @@ def find_part_motions(
     motions, shifted = leave_false_minima(states, motions, views, config.coarse, stacks, config.survey, **options)
     if config.reconsider:
         say("reconsidering each part")
-        motions, changed = reconsider(found, states, motions, views, config, stacks, **options)
+        limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
+        motions, changed = reconsider(found, states, motions, views, config, stacks, limit, **options)
     say("settling labels and motions")
     motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
     motions.diagnostics = {

@@ -37,41 +37,58 @@ def reconsider(
     views,
     config: PartMotionsConfig,
     stacks: list[DepthStack],
+    limit: int,
     *,
     seed: int,
     backend: str,
     device="cpu",
 ) -> tuple[PartMotions, list[dict]]:
-    """Exchange motions for others that explain what the refined rest leaves over, while the photographs agree.
+    """Exchange motions for others that explain what the refined rest leaves over, or add one, while the photographs agree.
 
-    For each part the search proposes other motions (``instead_of``); with each every surfel chooses its part anew and the states are
-    re-rendered; the best of all is refined and kept if the image loss falls by ``freedom_penalty``.  Returns the motions and
-    what was tried.
+    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``); with each every surfel chooses its
+    part anew and the states are re-rendered. The best exchange and the best addition are refined; the image loss must fall by
+    ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part.  Returns the motions and what was tried.
     """
     options = {"backend": backend, "device": device}
     level, log = config.coarse.levels[-1], []
-    cost = explanation_cost(states, motions, views, level, **options)
-    for _ in range(len(motions)):
+
+    def cost_of(m: PartMotions) -> float:
+        return explanation_cost(states, m, views, level, **options)
+
+    cost = cost_of(motions)
+
+    for _ in range(limit if len(motions) else 0):
+        exchanged = [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]
+        added = [(len(motions), m) for m in _with_part(found, states, motions, None)] if len(motions) < limit else []
         best = None
-        for part in range(len(motions)):
-            for transform, kind in instead_of(found, motions.transforms, motions.types, part):
-                transforms = motions.transforms.clone()
-                transforms[part] = transform
-                types = [*motions.types[:part], kind, *motions.types[part + 1 :]]
-                labels, margin = label_gaussians(relabel(found, transforms, types), states)
-                tried = replace(motions, types=types, transforms=transforms, labels=labels, margin=margin)
-                reached = explanation_cost(states, tried, views, level, **options)
-                if best is None or reached < best[0]:
-                    best = (reached, part, tried)
+        for tries, penalty in ((exchanged, config.freedom_penalty), (added, config.missing_penalty)):
+            if not tries:
+                continue
+            costs = [cost_of(m) for _, m in tries]
+            part, tried = tries[costs.index(min(costs))]
+            refined = refine(states, tried, views, config.coarse, stacks, seed=seed, **options)
+            reached = cost_of(refined)
+            change = "added" if part == len(motions) else "exchanged"
+            log.append({"change": change, "part": part, "type": tried.types[part], "before": cost, "tried": min(costs), "after": reached})
+            rank = reached / (1 - penalty)
+            if rank < cost and (best is None or rank < best[0]):
+                best = (rank, reached, refined)
         if best is None:
             break
-        refined = refine(states, best[2], views, config.coarse, stacks, seed=seed, **options)
-        reached = explanation_cost(states, refined, views, level, **options)
-        log.append({"part": best[1], "type": best[2].types[best[1]], "before": cost, "tried": best[0], "after": reached})
-        if reached >= cost * (1 - config.freedom_penalty):
-            break
-        motions, cost = refined, reached
+        _, cost, motions = best
     return motions, log
+
+
+def _with_part(found: Discovery, states, motions: PartMotions, part: int | None) -> list[PartMotions]:
+    """The motions with another one for ``part`` (None: with one more), labels chosen anew."""
+    k, out = len(motions) if part is None else part, []
+    for transform, kind in instead_of(found, motions.transforms, motions.types, part):
+        types = [*motions.types[:k], kind, *motions.types[k + 1 :]]
+        transforms = torch.cat([motions.transforms[:k], transform[None], motions.transforms[k + 1 :]])
+        confidence = motions.confidence if part is not None else torch.cat([motions.confidence, torch.ones(1)])
+        labels, margin = label_gaussians(relabel(found, transforms, types), states)
+        out.append(replace(motions, types=types, transforms=transforms, confidence=confidence, labels=labels, margin=margin))
+    return out
 
 
 def settle_labels(

@@ -22,11 +22,11 @@ def scene(monkeypatch):
     monkeypatch.setattr(settle, "relabel", lambda *a: None)
     monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
 
-    def reconsider(kind, T, proposed):
-        monkeypatch.setattr(settle, "instead_of", lambda *a: proposed)
+    def reconsider(kind, T, proposed, more=(), limit=1):
+        monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: more if part is None else proposed)
         motions = PartMotions([kind], T[None], torch.ones(1), [labels, labels], margins)
         config = PartMotionsConfig(coarse=COARSE)
-        return motions, *settle.reconsider(None, states, motions, views, config, [None, None], seed=0, backend="auto")
+        return motions, *settle.reconsider(None, states, motions, views, config, [None, None], limit, seed=0, backend="auto")
 
     return reconsider
 
@@ -36,7 +36,7 @@ def test_a_wrong_motion_is_exchanged_for_a_proposed_one_that_is_refined(scene):
     near[:3, 3] += torch.tensor([0.02, -0.02, 0.02])
     wrong = se3.from_screw(torch.tensor([0.0, 0, 1]).double(), torch.tensor([-0.4, 0.5, 0]).double(), -1.1)
     _, found, log = scene("revolute", wrong, [(hinge(), "revolute"), (near, "prismatic")])
-    assert found.types == ["prismatic"] and log[0]["type"] == "prismatic"
+    assert found.types == ["prismatic"] and log[0]["type"] == "prismatic" and log[0]["change"] == "exchanged"
     assert float((found.transforms[0] - slide()).norm()) < 0.01  # refined, from 0.035
     assert log[0]["after"] < log[0]["tried"] < log[0]["before"]
 
@@ -46,3 +46,11 @@ def test_a_right_motion_stays(scene):
     assert found is motions and len(log) == 1 and log[0]["after"] > log[0]["before"]
     motions, found, log = scene("prismatic", slide(), [])
     assert found is motions and log == []
+
+
+def test_a_further_part_must_win_by_more(scene):
+    other = slide()
+    other[:3, 3] *= -1
+    motions, found, log = scene("prismatic", slide(), [], [(other, "prismatic")], limit=2)
+    assert found is motions and [entry["change"] for entry in log] == ["added"]  # no Gaussian is its own, the images stay as they are
+    assert scene("prismatic", slide(), [], [(other, "prismatic")], limit=1)[2] == []  # no more parts than allowed

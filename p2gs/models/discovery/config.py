@@ -15,12 +15,11 @@ class DiscoveryConfig:
     tolerance: depth tolerance of the free-space test, times the measured noise.
     recoloured: a surface that is in place in the other state but differs by this in colour (0..1) has changed there.
     unexplained: cost of a moved point that no motion explains (0.35 is hiding in unseen space, 1 is hanging in free space).
-    part_cost: least drop of the mean cost over the moved surface for which a further part is believed ("auto").
-    part_cost_fixed: the same below a given number of parts.
+    part_cost: least drop of the mean cost over the moved surface for which a further part is believed.
     min_angle, max_angle: degrees searched.  max_slide: times the box diagonal.
     attach: weight of the rule that a hinge touches the part it carries.
     slide_bonus: a slide has two degrees of freedom less than a turn: share of a part's gain in its favour.
-    split, split_fixed: least share of its residual that half a part must lose with an amount of its own ("auto", below a given number).
+    split: least share of its residual that half a part must lose with an amount of its own.
     min_mass: least share of the moved surface of a part.  min_moved: fewest moved surfels a state below which nothing moved.
     search_weight: weight of the search's own value beside the image-space violation when explanations are ranked.
     candidates: how many complete explanations are handed back at most.
@@ -34,14 +33,12 @@ class DiscoveryConfig:
     recoloured: float = 0.2
     unexplained: float = 0.45
     part_cost: float = 0.03
-    part_cost_fixed: float = 0.02
     min_angle: float = 5.0
     max_angle: float = 135.0
     max_slide: float = 0.42
     attach: float = 0.8
     slide_bonus: float = 0.1
     split: float = 0.3
-    split_fixed: float = 0.2
     min_mass: float = 0.015
     min_moved: int = 12
     search_weight: float = 0.4

@@ -36,14 +36,13 @@ def discover(
 ) -> Discovery:
     """Find the moving parts, their motions and who belongs to them. No ground truth, no learning.
 
-    num_parts: upper bound that counts the static base, or "auto".  progress: called with a stage's name and the share done.
+    num_parts: upper bound that counts the static base, or "auto" (``max_parts``).  progress: called with a stage's name and the share done.
     Raises UserError for a bad ``num_parts``.  Deterministic for a seed.
     """
     config = config or DiscoveryConfig()
     if num_parts != "auto" and (not isinstance(num_parts, int) or num_parts < 1):
         raise UserError(f"num_parts is {num_parts!r}, expected 'auto' or a whole number of parts that counts the static base")
-    fixed = num_parts != "auto"
-    limit = (num_parts if fixed else config.max_parts) - 1
+    limit = (config.max_parts if num_parts == "auto" else num_parts) - 1
     tell = progress or (lambda stage, share: None)
     clock, seconds = time.perf_counter(), {}
 
@@ -63,19 +62,19 @@ def discover(
         swept = sweep(problem, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in problem.samples])
         still = static_axes(problem)
         lap("hypotheses", 0.4)
-        search = Search(problem, swept, limit, config.part_cost_fixed if fixed else config.part_cost)
+        search = Search(problem, swept, max(limit, config.max_parts - 1), config.part_cost)  # a bound cuts what is found, not the search
         solutions = search.solve()
         solutions += search.alternatives(solutions)
         lap("selection", 0.7)
         figures |= {"axes": axes.tolist(), "motions_tried": len(swept.motions), "search": search.trace}
         for value, chosen in solutions[: config.candidates]:
             if value > 0 and chosen:
-                explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, limit, fixed, still))
+                explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, limit, still))
         if explanations and len(explanations[0].motions) < limit:
             explanations += divided(problem, graphs, min(explanations, key=lambda e: e.score), still)
         for e in explanations:  # what the search says of the motions as they are now
             e.value = search.pool.total(search.pool.add(e.motions).tolist())
-            e.score += (0.0 if fixed else 0.2 * config.part_cost) * len(e.motions) - config.search_weight * e.value
+            e.score += 0.2 * config.part_cost * len(e.motions) - config.search_weight * e.value
         lap("labels", 0.95)
     if not explanations:
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]
@@ -108,22 +107,25 @@ def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate
     return Candidate([], found.problem.surfels, labelling.probability, 0.0, 0.0)
 
 
-def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int, count: int = 3) -> list[tuple[Tensor, str]]:
-    """Motions [4, 4] that best explain what all parts but ``part`` leave over, and their types: best first, without the part's own.
+def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int | None, count: int = 2) -> list[tuple[Tensor, str]]:
+    """Motions [4, 4] that best explain what all parts but ``part`` leave over (None: what all leave over), and their types: up to
+    ``count`` turns and as many slides, without the part's own.
 
     The search fits all parts to one another's remains while all are rough; with the others refined the same evidence can say more.
     """
-    search, own = found.search, as_motions(transforms, types)
+    search = found.search
     if search is None:
         return []
+    own = as_motions(transforms, types)
     rest = search.pool.add(own[torch.tensor([k for k in range(len(types)) if k != part], dtype=torch.long)]).tolist()
-    motions, _ = search.propose(rest, 96, 12)
+    motions, _ = search.propose(rest, 96, 12, each=True)
     if not len(motions):
         return []
     index = search.pool.add(motions).tolist()
     best = sorted(range(len(index)), key=lambda i: search.value([*rest, index[i]]), reverse=True)
-    far = own[part : part + 1].swept(search.probe, motions)[0] > search.radius
-    picked = [i for i in best if far[i]][:count]
+    known = own if part is None else own[part : part + 1]
+    far = (known.swept(search.probe, motions) > search.radius).all(0)
+    picked = [i for turn in (True, False) for i in [i for i in best if far[i] and bool(motions.turn[i]) == turn][:count]]
     return [(motions.transform(i), "revolute" if bool(motions.turn[i]) else "prismatic") for i in picked]
 
 
@@ -135,14 +137,14 @@ def as_motions(transforms: Tensor, types: list[str]) -> Motions:
     return Motions(turn, screw.axis.float(), screw.origin.float(), amount.float())
 
 
-def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, fixed: bool, axes: Tensor) -> Explanation:
+def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, axes: Tensor) -> Explanation:
     """Label and fit a chosen set; part those that share an axis but not an amount; drop parts without mass; score in image space."""
     cfg = problem.config
     motions, labelling = settle_parts(problem, graphs, motions, axes)
-    while len(motions) < limit:
+    while len(motions) < max(limit, cfg.max_parts - 1):
         tried = [split_amounts(problem, labelling, graphs, motions, k) for k in range(len(motions))]
         k = max(range(len(tried)), key=lambda i: tried[i][0])
-        if tried[k][0] < (cfg.split_fixed if fixed else cfg.split):
+        if tried[k][0] < cfg.split:
             break
         more, relabelled = settle_parts(problem, graphs, with_amounts(motions, k, *tried[k][1:]), axes)
         if min(masses(problem, relabelled)) < cfg.min_mass or same_motion(problem, more, k, len(more) - 1):
@@ -155,7 +157,7 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
             break
         motions = motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
         motions, labelling = settle_parts(problem, graphs, motions, axes, rounds=1)
-    return prune(problem, graphs, motions, labelling, value, axes)
+    return prune(problem, graphs, motions, labelling, value, limit, axes)
 
 
 def ranked(explanations: list[Explanation]) -> list[Explanation]:
@@ -179,8 +181,10 @@ def divided(problem: Problem, graphs: list[Graph], e: Explanation, axes: Tensor)
     return [Explanation(motions, labelling, e.value, total_score(problem, motions, labelling), only_images=True)]
 
 
-def prune(problem: Problem, graphs: list[Graph], motions: Motions, labelling: Labelling, value: float, axes: Tensor) -> Explanation:
-    """Drop parts, the least needed first, while the explanation of both states' images gets no worse without them."""
+def prune(
+    problem: Problem, graphs: list[Graph], motions: Motions, labelling: Labelling, value: float, limit: int, axes: Tensor
+) -> Explanation:
+    """Drop parts, the least needed first, down to ``limit`` and while the explanation of both states' images gets no worse without them."""
     score = total_score(problem, motions, labelling)
     while len(motions) > 1:
         tried = []
@@ -189,7 +193,7 @@ def prune(problem: Problem, graphs: list[Graph], motions: Motions, labelling: La
             relabelled = label(problem, fewer, graphs)
             tried.append((total_score(problem, fewer, relabelled), k, fewer))
         least, _, fewer = min(tried, key=lambda t: t[:2])
-        if least > score:
+        if least > score and len(motions) <= limit:
             break
         motions, labelling = settle_parts(problem, graphs, fewer, axes, rounds=1)
         score = total_score(problem, motions, labelling)

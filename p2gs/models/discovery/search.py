@@ -49,8 +49,11 @@ class Search:
         self.sweep_rows = [s.argsort()[w] for s, w in zip(self.samples, where, strict=False)]
         self.trace: list[dict] = []
 
-    def propose(self, chosen: list[int], count: int, fine: int, extra: Motions | None = None) -> tuple[Motions, Tensor]:
-        """The ``fine`` best sharpened motions for what the motions ``chosen`` leave over, and their gains."""
+    def propose(self, chosen: list[int], count: int, fine: int, extra: Motions | None = None, each: bool = False) -> tuple[Motions, Tensor]:
+        """The ``fine`` best sharpened motions for what the motions ``chosen`` leave over, and their gains.
+
+        each: as many slides as turns, since among many turns one often fits by chance a little better than a true slide.
+        """
         left = [(1 - a).clamp(0, 1) for a in self.pool.explained(chosen)]
         weights = [(x * w)[r] / w[r].sum().clamp_min(1e-9) for x, w, r in zip(left, self.problem.weights, self.sweep_rows, strict=False)]
         g = self.swept.gain(weights)
@@ -73,7 +76,12 @@ class Search:
         better = value[n:] > value[:n]
         both = both[torch.where(better, torch.arange(n) + n, torch.arange(n))]
         value = torch.maximum(value[:n], value[n:])
-        keep = distinct(both, value, self.probe, 0.5 * self.radius, fine)
+        if each:
+            kinds = [torch.where(kind, value, torch.full_like(value, -1.0)) for kind in (both.turn, ~both.turn)]
+            kept = [distinct(both, v, self.probe, 0.5 * self.radius, fine // 2) for v in kinds]
+            keep = torch.cat([k[v[k] >= 0] for k, v in zip(kept, kinds, strict=True)])
+        else:
+            keep = distinct(both, value, self.probe, 0.5 * self.radius, fine)
         motions, value = pattern_search(gain, both[keep], 0.5 * self.problem.landings[0].hc, 8, value=value[keep])
         keep = distinct(motions, value, self.probe, 0.3 * self.radius, fine)
         return motions[keep], value[keep]
