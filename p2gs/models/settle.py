@@ -56,7 +56,6 @@ def reconsider(
         return explanation_cost(states, m, views, level, **options)
 
     cost = cost_of(motions)
-
     for _ in range(limit if len(motions) else 0):
         exchanged = [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]
         added = [(len(motions), m) for m in _with_part(found, states, motions, None)] if len(motions) < limit else []
@@ -85,10 +84,15 @@ def _with_part(found: Discovery, states, motions: PartMotions, part: int | None)
     for transform, kind in instead_of(found, motions.transforms, motions.types, part):
         types = [*motions.types[:k], kind, *motions.types[k + 1 :]]
         transforms = torch.cat([motions.transforms[:k], transform[None], motions.transforms[k + 1 :]])
-        confidence = motions.confidence if part is not None else torch.cat([motions.confidence, torch.ones(1)])
-        labels, margin = label_gaussians(relabel(found, transforms, types), states)
-        out.append(replace(motions, types=types, transforms=transforms, confidence=confidence, labels=labels, margin=margin))
+        out.append(_relabelled(found, states, replace(motions, types=types, transforms=transforms)))
     return out
+
+
+def _relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:
+    """The same motions with labels chosen anew, and discovery's confidence in them under these."""
+    explanation = relabel(found, motions.transforms, motions.types)
+    labels, margin = label_gaussians(explanation, states)
+    return replace(motions, labels=labels, margin=margin, confidence=torch.tensor([m.confidence for m in explanation.motions]))
 
 
 def settle_labels(
@@ -105,10 +109,7 @@ def settle_labels(
         best = None
         # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from here on
         for name in ("kept", "anew"):
-            tried = motions
-            if name == "anew":
-                labels, margin = label_gaussians(relabel(found, motions.transforms, motions.types), states)
-                tried = replace(motions, labels=labels, margin=margin)
+            tried = _relabelled(found, states, motions) if name == "anew" else motions
             labels, count = settle_islands([s.gaussians for s in states], tried.labels, tried.transforms, config.islands)
             tried = refine(states, replace(tried, labels=labels), views, config.coarse, stacks, **options)
             reached = explanation_cost(states, tried, views, level, backend, device)

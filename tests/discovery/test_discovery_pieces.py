@@ -191,3 +191,4 @@ def test_relabel_by_the_true_motion_labels_like_the_search():
     again = relabel(found, torch.stack([m.transform for m in found.motions]), [m.type for m in found.motions])
     for s in (0, 1):
         assert float((again.probability[s].argmax(1) == found.probability[s].argmax(1)).float().mean()) > 0.97
+    assert again.motions[0].confidence == pytest.approx(found.motions[0].confidence, abs=0.05)

@@ -1,5 +1,7 @@
 """A part whose motion was fitted to the others' remains is asked for once more, and the photographs decide."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from test_finish import two_states
@@ -19,7 +21,8 @@ def scene(monkeypatch):
     """A slide of one panel; labels are known, what the search would propose is told by the test."""
     states, labels, views = two_states(slide())
     margins = [torch.ones(len(labels))] * 2
-    monkeypatch.setattr(settle, "relabel", lambda *a: None)
+    sure = SimpleNamespace(confidence=0.5)
+    monkeypatch.setattr(settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types)))
     monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
 
     def reconsider(kind, T, proposed, more=(), limit=1):
@@ -38,7 +41,7 @@ def test_a_wrong_motion_is_exchanged_for_a_proposed_one_that_is_refined(scene):
     _, found, log = scene("revolute", wrong, [(hinge(), "revolute"), (near, "prismatic")])
     assert found.types == ["prismatic"] and log[0]["type"] == "prismatic" and log[0]["change"] == "exchanged"
     assert float((found.transforms[0] - slide()).norm()) < 0.01  # refined, from 0.035
-    assert log[0]["after"] < log[0]["tried"] < log[0]["before"]
+    assert log[0]["after"] < log[0]["tried"] < log[0]["before"] and found.confidence.tolist() == [0.5]
 
 
 def test_a_right_motion_stays(scene):

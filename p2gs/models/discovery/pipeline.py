@@ -103,8 +103,9 @@ def discover(
 
 def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate:
     """The explanation by other motions: transforms [K, 4, 4] start -> end, types "revolute" | "prismatic". Every surfel chooses anew."""
-    labelling = label(found.problem, as_motions(transforms, types), found.graphs, revealed=True)
-    return Candidate([], found.problem.surfels, labelling.probability, 0.0, 0.0)
+    motions = as_motions(transforms, types)
+    labelling = label(found.problem, motions, found.graphs, revealed=True)
+    return Candidate(found_motions(found.problem, motions, labelling), found.problem.surfels, labelling.probability, 0.0, 0.0)
 
 
 def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int | None, count: int = 2) -> list[tuple[Tensor, str]]:
@@ -228,32 +229,37 @@ def masses(problem: Problem, labelling: Labelling) -> list[float]:
 
 def describe(problem: Problem, e: Explanation, start: StateEvidence, end: StateEvidence) -> Candidate:
     """Motions in words, confidences, labels of the input points."""
+    c = Candidate(found_motions(problem, e.motions, e.labelling), problem.surfels, e.labelling.probability, e.score, e.value)
+    c.labels_start = c.label_points(start.points, start.colours, 0)[0]
+    c.labels_end = c.label_points(end.points, end.colours, 1)[0]
+    return c
+
+
+def found_motions(problem: Problem, motions: Motions, labelling: Labelling) -> list[FoundMotion]:
+    """Each motion in words, with its confidence and mass under the labels."""
     found = []
-    mass = masses(problem, e.labelling)
-    bad = [violation(problem, e.motions, e.labelling.labels(s), s) for s in (0, 1)]
-    pays = [p for p, _ in problem.pay(e.motions)] if len(e.motions) else []
-    plausible = plausibility(problem, e.motions, pays, problem.samples, False) if len(e.motions) else torch.zeros(0)
-    for k in range(len(e.motions)):
-        T = e.motions.transform(k)
-        turn = bool(e.motions.turn[k])
-        mine = [e.labelling.labels(s) == k + 1 for s in (0, 1)]
+    mass = masses(problem, labelling)
+    bad = [violation(problem, motions, labelling.labels(s), s) for s in (0, 1)]
+    pays = [p for p, _ in problem.pay(motions)] if len(motions) else []
+    plausible = plausibility(problem, motions, pays, problem.samples, False) if len(motions) else torch.zeros(0)
+    for k in range(len(motions)):
+        T = motions.transform(k)
+        turn = bool(motions.turn[k])
+        mine = [labelling.labels(s) == k + 1 for s in (0, 1)]
         agree = [1 - float(bad[s][mine[s]].mean()) if mine[s].any() else 0.0 for s in (0, 1)]
         middle = problem.surfels[0].points[mine[0]].mean(0).double() if mine[0].any() else problem.centre.double()
-        axis = e.motions.axis[k].double()
+        axis = motions.axis[k].double()
         axis = axis / axis.norm()
-        origin = e.motions.centre[k].double()
+        origin = motions.centre[k].double()
         origin = origin + axis * ((middle - origin) @ axis) if turn else middle
         found.append(
             FoundMotion(
                 type="revolute" if turn else "prismatic", transform=T, axis=axis, origin=origin,
-                amount=math.degrees(float(e.motions.amount[k])) if turn else float(e.motions.amount[k]),
+                amount=math.degrees(float(motions.amount[k])) if turn else float(motions.amount[k]),
                 confidence=float(max(0.0, min(agree)) * plausible[k].clamp(0, 1) * min(1.0, mass[k] / 0.05)), mass=mass[k],
             )
         )  # fmt: skip
-    c = Candidate(found, problem.surfels, e.labelling.probability, e.score, e.value)
-    c.labels_start = c.label_points(start.points, start.colours, 0)[0]
-    c.labels_end = c.label_points(end.points, end.colours, 1)[0]
-    return c
+    return found
 
 
 def nearest_evidence(problem: Problem, points: Tensor, state: int) -> Tensor:
