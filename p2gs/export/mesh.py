@@ -15,7 +15,7 @@ from p2gs.export.paint import draw, rasterizer_of
 from p2gs.export.pose import part_transform, pose
 from p2gs.export.tsdf import DepthView, Mesh, add_normals, fuse, largest_components
 from p2gs.export.twin_json import load_twin
-from p2gs.export.unseen import unseen_sides
+from p2gs.export.unseen import close_unseen_sides
 from p2gs.export.views import NamedCamera, bounds, orbit, read_cameras
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, UserError
 
@@ -101,7 +101,7 @@ def mesh_cameras(obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: 
 
 def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> list[Mesh]:
     """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.  The base's
-    underside and other sides that no camera saw are closed (``unseen_sides``).
+    underside and other sides that no camera saw are closed (``close_unseen_sides``).
 
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
     """
@@ -125,7 +125,7 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
         poses = [motion[state] for state, _ in cameras]
         mesh = largest_components(fuse(views, poses, k, voxel, trunc=TRUNCATION * voxel, behind=BEHIND * voxel))
         if part.joint is None:
-            mesh = Mesh.join([mesh, unseen_sides(mesh, views, poses, k, voxel, TRUNCATION * voxel)])
+            mesh = close_unseen_sides(mesh, views, poses, k, voxel, TRUNCATION * voxel)
         meshes.append(mesh)
     return meshes
 

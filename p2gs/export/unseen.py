@@ -1,7 +1,8 @@
 """Sides of a mesh that no camera saw: what stands on the floor has an underside, though no photograph shows it.
 
 A mesh from photographs is open where nobody looked. A side of its bounding box is closed by a plane where space just inside was never seen
-to be empty, no surface was seen near, and what was seen of the object reaches down to that plane around it.
+to be empty, no surface was seen near, and what was seen of the object reaches down to that plane around it. The plane's rim is drawn to the
+mesh's open edges.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from p2gs.export.tsdf import DepthView, Mesh, seen_points
 
-STEP, NEAR = 2.0, 4.0  # voxels: between a plane's vertices; a seen surface nearer than this is the side itself
+NEAR = 4.0  # voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges
 LEAST = 0.2  # share of a side of the box that must be unseen for it to be closed
 RIM = 0.5  # share of the unseen area's rim that must touch seen surface
 
@@ -36,22 +37,22 @@ def seen_empty(points: Tensor, views: Sequence[DepthView], poses: Sequence[Tenso
     return empty
 
 
-def unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, clearance: float) -> Mesh:
-    """Planes on the unseen sides of the part's box, coloured as the seen surface nearest to them; empty where every side is seen.
+def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, clearance: float) -> Mesh:
+    """The mesh with planes on the unseen sides of its box, sewn to its open edges and coloured as the seen surface nearest to them.
 
     mesh, poses: start-state coordinates of the part (its number in ``views``).  voxel: of the mesh.  clearance: as in ``seen_empty``.
     """
     from scipy.spatial import cKDTree
 
     if len(mesh.faces) == 0:
-        return Mesh.empty()
+        return mesh
     # the mesh goes on for a voxel or two beyond the edges of what was seen
     seen = torch.cat([seen_points(v, part, T, stride=2) for v, T in zip(views, poses, strict=True)]).numpy()
     lo, hi = np.quantile(seen, 0.002, axis=0), np.quantile(seen, 0.998, axis=0)
     tree, planes = cKDTree(mesh.vertices), []
     for axis in range(3):
         across = [i for i in range(3) if i != axis]
-        shape = [max(2, round((hi[i] - lo[i]) / (STEP * voxel)) + 1) for i in across]
+        shape = [max(2, round((hi[i] - lo[i]) / voxel) + 1) for i in across]
         grid = np.meshgrid(*(np.linspace(lo[i], hi[i], n) for i, n in zip(across, shape, strict=True)), indexing="ij")
         for at, outward in ((lo[axis], -1.0), (hi[axis], 1.0)):
             points = np.full((grid[0].size, 3), at)
@@ -65,7 +66,9 @@ def unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor]
             area = solid.reshape(shape)
             if _touching(area, (distance < NEAR * voxel).reshape(shape)) >= RIM:
                 planes.append(_plane(points, area, mesh.colours[nearest], outward * (-1) ** axis))
-    return Mesh.join(planes) if planes else Mesh.empty()
+    for plane in planes:
+        mesh = _sewn(mesh, plane, NEAR * voxel)
+    return mesh
 
 
 def _touching(area: np.ndarray, seen: np.ndarray) -> float:
@@ -86,3 +89,27 @@ def _plane(points: np.ndarray, area: np.ndarray, colours: np.ndarray, sign: floa
     faces = np.concatenate([np.stack([corners[k] for k in t], 1) for t in ((0, 1, 2), (0, 2, 3))])
     used, renumbered = np.unique(faces, return_inverse=True)
     return Mesh(points[used], renumbered.reshape(-1, 3), colours[used])
+
+
+def _open_vertices(faces: np.ndarray) -> np.ndarray:
+    """Indices of the vertices on edges that only one triangle has."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, count = np.unique(edges, axis=0, return_counts=True)
+    return np.unique(edges[count == 1])
+
+
+def _sewn(mesh: Mesh, plane: Mesh, reach: float) -> Mesh:
+    """Both as one; the plane's rim takes the vertices of the mesh's open edges where these are within ``reach``."""
+    from scipy.spatial import cKDTree
+
+    rim, edge = _open_vertices(plane.faces), _open_vertices(mesh.faces)
+    index = np.arange(len(plane.vertices)) + len(mesh.vertices)
+    if len(rim) and len(edge):
+        distance, nearest = cKDTree(mesh.vertices[edge]).query(plane.vertices[rim])
+        index[rim[distance < reach]] = edge[nearest[distance < reach]]
+    faces = index[plane.faces]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    both = Mesh.join([mesh, Mesh(plane.vertices, np.zeros((0, 3), np.int64), plane.colours)])
+    faces = np.concatenate([mesh.faces, faces])
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return Mesh(both.vertices[used], renumbered.reshape(-1, 3), both.colours[used])

@@ -12,7 +12,7 @@ from p2gs.data.furniture import box
 from p2gs.data.raytrace import trace
 from p2gs.data.textures import Texture
 from p2gs.export.tsdf import DepthView, Mesh, add_normals, fuse
-from p2gs.export.unseen import seen_empty, unseen_sides
+from p2gs.export.unseen import close_unseen_sides, seen_empty
 
 EYE = torch.eye(4, dtype=torch.float64)
 VOXEL = 0.03
@@ -51,32 +51,31 @@ def look(primitives, cameras):
 
 
 def closed(primitives, elevations=(15.0, 40.0)):
+    """A mesh as it was seen, and with its unseen sides closed."""
     views = look(primitives, ring(12, 160, elevations=elevations))
     poses = [EYE] * len(views)
     mesh = fuse(views, poses, 0, VOXEL, 4 * VOXEL, 2 * VOXEL)
-    return mesh, unseen_sides(mesh, views, poses, 0, VOXEL, 4 * VOXEL)
+    return mesh, close_unseen_sides(mesh, views, poses, 0, VOXEL, 4 * VOXEL)
 
 
 def test_an_underside_that_no_camera_saw_is_closed():
-    mesh, plane = closed(BLOCK)
-    assert np.allclose(plane.vertices[:, 2], -0.3, atol=VOXEL)
-    sheet = trimesh.Trimesh(plane.vertices, plane.faces, process=False)
-    assert sheet.area == pytest.approx(0.8, rel=0.15) and (sheet.face_normals[:, 2] < -0.99).all()
-    assert np.abs(plane.colours.astype(int) - 128).max() < 3
+    seen, whole = (trimesh.Trimesh(m.vertices, m.faces, process=False) for m in closed(BLOCK))
+    down = whole.face_normals[:, 2] < -0.5
+    assert whole.area_faces[down].sum() == pytest.approx(0.85, rel=0.15) and not (seen.face_normals[:, 2] < -0.5).any()
+    assert np.abs(whole.triangles_center[down][:, 2] + 0.3).max() < 2 * VOXEL
+    assert whole.volume == pytest.approx(0.48, rel=0.06)  # faces look outward
+    assert len(whole.split(only_watertight=False)) == len(seen.split(only_watertight=False))  # sewn on
 
 
-def test_a_closed_block_has_its_volume():
-    mesh, plane = closed(BLOCK)
-    whole = Mesh.join([mesh, plane])
-    assert trimesh.Trimesh(whole.vertices, whole.faces, process=False).volume == pytest.approx(0.48, rel=0.06)
+def test_what_closes_a_side_has_the_colours_around_it():
+    assert np.abs(closed(BLOCK)[1].colours.astype(int) - 128).max() < 3
 
 
 def test_what_is_seen_is_left_alone():
-    assert len(closed(BLOCK, (15.0, 40.0, -30.0))[1].faces) == 0
-    for primitives in (CRATE, TABLE):
-        mesh, plane = closed(primitives)
-        assert len(mesh.faces) and len(plane.faces) == 0
-    assert len(unseen_sides(Mesh.empty(), [], [], 0, VOXEL, 4 * VOXEL).faces) == 0
+    for primitives, elevations in ((BLOCK, (15.0, 40.0, -30.0)), (CRATE, (15.0, 40.0)), (TABLE, (15.0, 40.0))):
+        mesh, same = closed(primitives, elevations)
+        assert len(mesh.faces) and same is mesh
+    assert len(close_unseen_sides(Mesh.empty(), [], [], 0, VOXEL, 4 * VOXEL).faces) == 0
 
 
 def test_seen_empty_tells_what_is_before_and_behind():
