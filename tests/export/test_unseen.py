@@ -60,9 +60,8 @@ def closed(primitives, elevations=(15.0, 40.0)):
 
 def test_an_underside_that_no_camera_saw_is_closed():
     seen, whole = (trimesh.Trimesh(m.vertices, m.faces, process=False) for m in closed(BLOCK))
-    down = whole.face_normals[:, 2] < -0.5
-    assert whole.area_faces[down].sum() == pytest.approx(0.85, rel=0.15) and not (seen.face_normals[:, 2] < -0.5).any()
-    assert np.abs(whole.triangles_center[down][:, 2] + 0.3).max() < 2 * VOXEL
+    down = [float(m.area_faces[m.face_normals[:, 2] < -0.5].sum()) for m in (seen, whole)]
+    assert down[1] - down[0] == pytest.approx(0.8, rel=0.1) and whole.bounds[0, 2] == seen.bounds[0, 2]
     assert whole.volume == pytest.approx(0.48, rel=0.06)  # faces look outward
     assert len(whole.split(only_watertight=False)) == len(seen.split(only_watertight=False))  # sewn on
 
