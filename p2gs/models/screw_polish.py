@@ -28,7 +28,8 @@ class PolishConfig:
     units of displacement at the part's rim; falls to a hundredth.  ssim_lambda: weight of SSIM against L1; high, because shading
     differs between states while structure does not.  min_margin: Gaussians whose label is less clear than this (internal units)
     are left out.  free_static, free_moving: so are those which the other state's cameras see through by more than this, of the base and
-    of moving parts (internal units; 0 = kept).
+    of moving parts (internal units; 0 = kept).  front: a view has no say on a surface that its own state's cameras saw from directions
+    whose cosine with the view's is below this (-1: all views have).
     """
 
     steps: int = 200
