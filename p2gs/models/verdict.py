@@ -94,7 +94,7 @@ def _discovery(d: dict, say) -> None:
         second = min(r for i, r in enumerate(ranks) if i != found["chosen"])
         if second < best * (1 + limit("close_call")):
             gap = second / best - 1
-            text = f"Two explanations fit the images almost alike ({gap:.1%} apart): other parts are possible (try num_parts)."
+            text = f"Two explanations fit the images almost alike ({gap:.1%} apart): other parts are possible (try another seed)."
             say("discovery", text, "note")
     chosen = found["explanations"][found["chosen"]] if found["chosen"] is not None else {}
     for r in chosen.get("reductions", []):
