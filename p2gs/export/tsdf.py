@@ -47,6 +47,11 @@ class Mesh:
     def transformed(self, T: np.ndarray) -> "Mesh":
         return Mesh(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces, self.colours)
 
+    def without_unused(self) -> "Mesh":
+        """Without vertices that no triangle has."""
+        used, renumbered = np.unique(self.faces, return_inverse=True)
+        return Mesh(self.vertices[used], renumbered.reshape(-1, 3), self.colours[used])
+
     @staticmethod
     def join(meshes: Sequence["Mesh"]) -> "Mesh":
         offsets = np.cumsum([0] + [len(m.vertices) for m in meshes])
@@ -106,10 +111,26 @@ def fuse(views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: 
         return Mesh.empty()
     grid = ActiveGrid.around(points, voxel)
     maps = [_pixel_table(v, part) for v in views]
-    matrices = [(v.camera.K.double() @ (v.camera.viewmat.double() @ T)[:3]).float() for v, T in zip(views, poses, strict=True)]
+    matrices = [pixel_matrix(v.camera, T).float() for v, T in zip(views, poses, strict=True)]
     chunks = grid.centers().split(CHUNK)  # small enough to stay in cache through all views
     field, weight, colour = (torch.cat(x) for x in zip(*(_integrate(x, views, maps, matrices, trunc, behind) for x in chunks), strict=True))
     return grid.surface(field, weight > 0, colour)
+
+
+def pixel_matrix(camera: Camera, T: Tensor) -> Tensor:
+    """[3, 4] float64: coordinates that the pose T [4, 4] carries to the world -> pixels times depth."""
+    return camera.K.double() @ (camera.viewmat.double() @ T)[:3]
+
+
+def pixels(columns: Tensor, M: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Depth [n] and flat pixel [n] of points [3, n] under ``pixel_matrix`` M; the pixel is H W outside the image."""
+    width, height = camera.width, camera.height
+    p = torch.addmm(M[:, 3:], M[:, :3], columns)
+    z = p[2]
+    u, v = p[:2] / z.clamp_min(1e-6)
+    pixel = v.clamp(0, height - 1).long() * width + u.clamp(0, width - 1).long()
+    outside = (z < 1e-4) | (u < 0) | (v < 0) | (u >= width) | (v >= height)
+    return z, pixel.masked_fill_(outside, width * height)
 
 
 def _pixel_table(view: DepthView, part: int) -> Tensor:
@@ -126,13 +147,8 @@ def _integrate(x: Tensor, views, maps, matrices, trunc: float, behind: float) ->
     tint = torch.full((len(x), 4), 1e-9)
     columns = x.T.contiguous()
     for view, table, M in zip(views, maps, matrices, strict=True):
-        width, height = view.camera.width, view.camera.height
-        p = torch.addmm(M[:, 3:], M[:, :3], columns)
-        z = p[2]
-        u, v = p[:2] / z.clamp_min(1e-6)
-        pixel = v.clamp(0, height - 1).long() * width + u.clamp(0, width - 1).long()
-        outside = (z < 1e-4) | (u < 0) | (v < 0) | (u >= width) | (v >= height)
-        row = table.index_select(0, pixel.masked_fill_(outside, width * height))
+        z, pixel = pixels(columns, M, view.camera)
+        row = table.index_select(0, pixel)
         gap = row[:, 0] - z
         d = gap * row[:, 1]
         free = (gap > trunc) & (d > 0.5 * trunc)
@@ -250,5 +266,4 @@ def largest_components(mesh: Mesh, fraction: float = 0.1) -> Mesh:
     label = connected_components(graph, directed=False)[1][f[:, 0]]
     count = np.bincount(label)
     keep = f[count[label] >= fraction * count.max()]
-    used, renumbered = np.unique(keep, return_inverse=True)
-    return Mesh(mesh.vertices[used], renumbered.reshape(-1, 3), mesh.colours[used])
+    return Mesh(mesh.vertices, keep, mesh.colours).without_unused()

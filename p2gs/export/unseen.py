@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from p2gs.export.tsdf import DepthView, Mesh, seen_points
+from p2gs.export.tsdf import DepthView, Mesh, pixel_matrix, pixels, seen_points
 
 NEAR = 4.0  # voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges
 LEAST = 0.2  # share of a side of the box that must be unseen for it to be closed
@@ -23,17 +23,11 @@ RIM = 0.5  # share of the unseen area's rim that must touch seen surface
 def seen_empty(points: Tensor, views: Sequence[DepthView], poses: Sequence[Tensor], clearance: float) -> Tensor:
     """[n] whether some view sees surface further than ``clearance`` behind a point, or nothing. points [n, 3] float64, start-state
     coordinates of the part that ``poses`` (start-state coordinates -> world, [4, 4] a view) carry."""
-    empty = torch.zeros(len(points), dtype=torch.bool)
+    empty, columns = torch.zeros(len(points), dtype=torch.bool), points.T.contiguous()
     for view, T in zip(views, poses, strict=True):
-        M = (view.camera.K.double() @ (view.camera.viewmat.double() @ T)[:3]).to(points)
-        p = points @ M[:, :3].T + M[:, 3]
-        z = p[:, 2]
-        height, width = view.depth.shape
-        u, v = (p[:, :2] / z.clamp_min(1e-6)[:, None]).T
-        inside = (z > 1e-4) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        pixel = v.clamp(0, height - 1).long() * width + u.clamp(0, width - 1).long()
-        depth = torch.where(view.labels < 0, torch.full_like(view.depth, 1e9), view.depth).reshape(-1)[pixel]
-        empty |= inside & (depth - z > clearance)
+        z, pixel = pixels(columns, pixel_matrix(view.camera, T).to(points), view.camera)
+        depth = torch.where(view.labels < 0, torch.full_like(view.depth, torch.inf), view.depth).reshape(-1)
+        empty |= torch.cat([depth, depth.new_tensor([-torch.inf])])[pixel] - z > clearance
     return empty
 
 
@@ -87,8 +81,7 @@ def _plane(points: np.ndarray, area: np.ndarray, colours: np.ndarray, sign: floa
     if sign < 0:
         corners = corners[::-1]
     faces = np.concatenate([np.stack([corners[k] for k in t], 1) for t in ((0, 1, 2), (0, 2, 3))])
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return Mesh(points[used], renumbered.reshape(-1, 3), colours[used])
+    return Mesh(points, faces, colours).without_unused()
 
 
 def _open_vertices(faces: np.ndarray) -> np.ndarray:
@@ -109,7 +102,5 @@ def _sewn(mesh: Mesh, plane: Mesh, reach: float) -> Mesh:
         index[rim[distance < reach]] = edge[nearest[distance < reach]]
     faces = index[plane.faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    both = Mesh.join([mesh, Mesh(plane.vertices, np.zeros((0, 3), np.int64), plane.colours)])
-    faces = np.concatenate([mesh.faces, faces])
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return Mesh(both.vertices[used], renumbered.reshape(-1, 3), both.colours[used])
+    vertices, colours = (np.concatenate(x) for x in ((mesh.vertices, plane.vertices), (mesh.colours, plane.colours)))
+    return Mesh(vertices, np.concatenate([mesh.faces, faces]), colours).without_unused()

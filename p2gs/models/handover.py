@@ -41,6 +41,13 @@ class PartMotions:
     def __len__(self) -> int:
         return len(self.types)
 
+    def with_motion(self, k: int, kind: str, transform: Tensor) -> "PartMotions":
+        """The same with another type and transform [4, 4] for entry ``k``, or with one entry more (k = len; its labels and confidence are
+        not known)."""
+        types = [*self.types[:k], kind, *self.types[k + 1 :]]
+        transforms = torch.cat([self.transforms[:k], transform[None], self.transforms[k + 1 :]])
+        return dataclasses.replace(self, types=types, transforms=transforms)
+
 
 @dataclass
 class CanonicalGaussians:

@@ -119,9 +119,7 @@ def _as_slides(states, motions: PartMotions, k: int) -> list[PartMotions]:
             ways += [along * (way @ along), along * way.norm() * torch.sign(way @ along)]
     out = []
     for w in ways:
-        T = motions.transforms.clone()
-        T[k] = torch.eye(4).double()
-        T[k, :3, 3] = w
-        types = [*motions.types[:k], "prismatic", *motions.types[k + 1 :]]
-        out.append(PartMotions(types, T, motions.confidence, motions.labels, motions.margin, motions.diagnostics))
+        T = torch.eye(4).double()
+        T[:3, 3] = w
+        out.append(motions.with_motion(k, "prismatic", T))
     return out

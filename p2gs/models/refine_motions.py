@@ -44,7 +44,7 @@ def refine(
         return motions
     sides = sides_of(states, motions, views, config, stacks)
     result, _ = polish(sides, motions.transforms, motions.types, config, seed=seed, backend=backend, device=device)
-    return PartMotions(motions.types, result, motions.confidence, motions.labels, motions.margin, motions.diagnostics)
+    return replace(motions, transforms=result)
 
 
 def single_ways(
@@ -99,9 +99,8 @@ def survey(
                 if float(step[3:].norm()) < 0.5 * abs(size):
                     continue
                 T = apply_step(motions.transforms[k], centre, radius, step)
-                transforms = motions.transforms.clone()
-                transforms[k] = se3.project_revolute(T) if motions.types[k] == "revolute" else T
-                tried = replace(motions, transforms=transforms)
+                T = se3.project_revolute(T) if motions.types[k] == "revolute" else T
+                tried = motions.with_motion(k, motions.types[k], T)
                 cost = explanation_cost(states, tried, views, level, backend, device)
                 if cost < best:
                     best, found = cost, tried

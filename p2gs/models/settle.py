@@ -82,9 +82,7 @@ def _with_part(found: Discovery, states, motions: PartMotions, part: int | None)
     """The motions with another one for ``part`` (None: with one more), labels chosen anew."""
     k, out = len(motions) if part is None else part, []
     for transform, kind in instead_of(found, motions.transforms, motions.types, part):
-        types = [*motions.types[:k], kind, *motions.types[k + 1 :]]
-        transforms = torch.cat([motions.transforms[:k], transform[None], motions.transforms[k + 1 :]])
-        out.append(_relabelled(found, states, replace(motions, types=types, transforms=transforms)))
+        out.append(_relabelled(found, states, motions.with_motion(k, kind, transform)))
     return out
 
 

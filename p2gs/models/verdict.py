@@ -163,13 +163,12 @@ def _joints(d: dict, say, diagonal: float) -> None:
             reasons.append("the images hardly hold it: a small displacement does not make them worse")
         if j["fall"] > limit("fall"):
             reasons.append(f"a small change of the joint makes the images {j['fall']:.0%} better")
+        why = "; ".join(reasons) or "several measures are middling"
         if j["confidence"] < limit("confidence"):
-            why = "; ".join(reasons) or "several measures are middling"
             text = f"{name} ({j['type']}): {why}; its motion is not reliable (confidence {j['confidence']:.2f})"
             earlier = j["confidence_by_stage"]
             if "discovery" in earlier:
                 text += f"; discovery handed it over with {earlier['discovery']:.2f}, articulation with {earlier['articulation']:.2f}"
             say(next(s for s, c in earlier.items() if c < limit("confidence")), text + ".")
         elif reasons or j["confidence"] < limit("sure"):
-            why = "; ".join(reasons) or "several measures are middling"
             say("finish", f"{name} ({j['type']}): {why} (confidence {j['confidence']:.2f}).", "note")

@@ -69,7 +69,7 @@ def discover(
         figures |= {"axes": axes.tolist(), "motions_tried": len(swept.motions), "search": search.trace}
         for value, chosen in solutions[: config.candidates]:
             if value > 0 and chosen:
-                explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, limit, still))
+                explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, search.limit, limit, still))
         if explanations and len(explanations[0].motions) < limit:
             explanations += divided(problem, graphs, min(explanations, key=lambda e: e.score), still)
         for e in explanations:  # what the search says of the motions as they are now
@@ -138,11 +138,11 @@ def as_motions(transforms: Tensor, types: list[str]) -> Motions:
     return Motions(turn, screw.axis.float(), screw.origin.float(), amount.float())
 
 
-def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, axes: Tensor) -> Explanation:
-    """Label and fit a chosen set; part those that share an axis but not an amount; drop parts without mass; score in image space."""
+def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, most: int, limit: int, axes: Tensor) -> Explanation:
+    """Label and fit a chosen set; part those that share an axis but not an amount (up to ``most``); drop those without mass; score."""
     cfg = problem.config
     motions, labelling = settle_parts(problem, graphs, motions, axes)
-    while len(motions) < max(limit, cfg.max_parts - 1):
+    while len(motions) < most:
         tried = [split_amounts(problem, labelling, graphs, motions, k) for k in range(len(motions))]
         k = max(range(len(tried)), key=lambda i: tried[i][0])
         if tried[k][0] < cfg.split:
