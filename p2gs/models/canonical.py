@@ -27,6 +27,8 @@ class CanonicalConfig:
     state's Gaussians as they are, at canonical time 0, with no observed pairs.
     min_opacity: fainter Gaussians take no part in D and matching.  trim: fraction of the largest distances left out of D (floaters).
     free_space: tolerance (internal units) of the test that drops or relabels what the other state's cameras see through; 0 = off.
+    hidden: what only the poorer state saw is kept where this share of the richer state's views has something in front of it; elsewhere
+    the richer state shows what there is (0 = all is kept; needs free_space).
     """
 
     beta: Literal["global", "uniform", "per_part"] = "global"
@@ -37,6 +39,7 @@ class CanonicalConfig:
     min_opacity: float = 0.5
     trim: float = 0.02
     free_space: float = 0.03
+    hidden: float = 0.75
 
 
 def keep_rows(c: CanonicalGaussians, labels: Tensor, keep: Tensor) -> CanonicalGaussians:
@@ -115,9 +118,16 @@ def blend(a: GaussianTensors, b: GaussianTensors, weight: float | Tensor) -> Gau
     return GaussianTensors(quats=so3.quat_normalize(mix(qa, qb)), **mixed)
 
 
-def fuse(g0: GaussianTensors, g1: GaussianTensors, motions: PartMotions | None, config: CanonicalConfig) -> CanonicalGaussians:
+def fuse(
+    g0: GaussianTensors,
+    g1: GaussianTensors,
+    motions: PartMotions | None,
+    config: CanonicalConfig,
+    hidden: tuple[Tensor, Tensor] | None = None,
+) -> CanonicalGaussians:
     """Two single-state reconstructions -> one canonical field.
 
+    hidden: [N] float by state, the share of the other state's views that has something in front of each Gaussian (``hidden_share``).
     Without motions (or with ``correspondence: hungarian``) a matched pair becomes beta mu0 + (1-beta) mu1 and remembers its chord.
     Raises UserError when ``beta: per_part`` is asked for without parts.
     """
@@ -142,7 +152,7 @@ def fuse(g0: GaussianTensors, g1: GaussianTensors, motions: PartMotions | None, 
                 betas[k] = beta_weight(motion_richness(a, p1, config.trim), motion_richness(b, p0, config.trim))
     if motions is None or config.correspondence == "hungarian":
         return _fuse_chords(g0, g1, motions, solid, betas, d01 >= d10, config)
-    return _fuse_motions(g0, g1, motions, solid, betas, d01 >= d10, config)
+    return _fuse_motions(g0, g1, motions, solid, betas, d01 >= d10, config, hidden)
 
 
 def _start_state_only(g0, motions) -> CanonicalGaussians:
@@ -198,7 +208,7 @@ def _with_pairs(g, betas, labels, margin, index, mu0, mu1, offsets=None) -> Cano
     return CanonicalGaussians(g.clone(), betas, labels, margin, paired, both[0], both[1], offsets)
 
 
-def _fuse_motions(g0, g1, motions, solid, betas, start_is_rich, config) -> CanonicalGaussians:
+def _fuse_motions(g0, g1, motions, solid, betas, start_is_rich, config, hidden) -> CanonicalGaussians:
     """Carry both states to canonical time along the screws, match there, and join."""
     T, times = with_static(motions.transforms), 1.0 - betas
     labels, margin = motions.labels, motions.margin
@@ -217,6 +227,8 @@ def _fuse_motions(g0, g1, motions, solid, betas, start_is_rich, config) -> Canon
         spacing = knn(at[rich].means, None, 1, True)[0][:, 0].median()
         distance = knn(at[rich].means, at[poor].means, 1, False)[0][:, 0]
         unseen = (distance > 3 * spacing) & (torch.sigmoid(at[poor].opacity_logits) > 0.1)
+        if hidden is not None:
+            unseen &= hidden[poor] >= config.hidden
         g = GaussianTensors.cat([at[rich], at[poor][unseen]])
         index = own
         new_labels = torch.cat([labels[rich], labels[poor][unseen]])

@@ -10,13 +10,15 @@ from torch import Tensor
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.canonical import CanonicalConfig, carry, fuse, keep_rows, with_static
 from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.free_space import explain_by_free_space
+from p2gs.models.free_space import explain_by_free_space, hidden_share
 from p2gs.models.handover import CanonicalGaussians, PartMotions, StateGaussians
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
 from p2gs.models.splats import Splats
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors
+
+SURFACE = 0.015  # tolerance of rendered depth (internal units): nearer than this to a surface is on it
 
 
 @dataclass
@@ -47,7 +49,13 @@ class CanonicalFusionPhase(ImagePhase):
         **common,
     ):
         super().__init__(config, losses, views, **common)
-        fused = fuse(states[0].gaussians, states[1].gaussians, motions, config.canonical)
+        hidden = None
+        if stacks is not None and motions is not None and config.canonical.hidden > 0:
+            away = (motions.transforms, se3.inverse(motions.transforms))
+            hidden = tuple(
+                hidden_share(s.gaussians.means, motions.labels[i], away[i], stacks[1 - i], SURFACE) for i, s in enumerate(states)
+            )
+        fused = fuse(states[0].gaussians, states[1].gaussians, motions, config.canonical, hidden)
         if stacks is not None and motions is not None and fused.offsets is None and config.canonical.free_space > 0:
             T, tau = with_static(motions.transforms), config.canonical.free_space
             means = fused.gaussians.means

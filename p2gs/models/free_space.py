@@ -56,3 +56,15 @@ def seen_through(means: Tensor, labels: Tensor, transforms: Tensor, stack: Depth
         free, on, _ = stack.counts(points, tau_moving if k else tau_static)
         out[rows] = classify(free, on, need=4, ratio=2.0)[0]
     return out
+
+
+@torch.no_grad()
+def hidden_share(means: Tensor, labels: Tensor, transforms: Tensor, stack: DepthStack, tau: float) -> Tensor:
+    """Share of the other state's views in which something is in front of each Gaussian of one state, carried there, [N] float.
+
+    means [N, 3]; labels [N]; transforms [K-1, 4, 4] to the other state; stack: rendered depth of the other state; tau: tolerance along the
+    ray (scene units). Views that do not contain a Gaussian say nothing; 0 where none does.
+    """
+    T = torch.cat([torch.eye(4, dtype=transforms.dtype)[None], transforms]).to(means)[labels]
+    free, on, behind = stack.counts((T[:, :3, :3] * means[:, None]).sum(-1) + T[:, :3, 3], tau)
+    return behind / (free + on + behind).clamp_min(1)

@@ -96,6 +96,19 @@ def test_fused_gaussians_meet_both_states_along_the_screw(beta, fusion):
     assert int(fused.paired.sum()) > 100
 
 
+def test_of_the_poorer_state_only_what_the_richer_one_hides_is_added():
+    g0, g1, motions = door_and_wall()
+    lone = torch.arange(len(g0)) < 20
+    shift = torch.where(lone[:, None], torch.tensor([0.0, -0.5, 0.0]), torch.zeros(3))  # twenty of each state have no counterpart
+    a, b = (GaussianTensors(g.means + shift * (1 + s), g.quats, g.log_scales, g.opacity_logits, g.sh) for s, g in enumerate((g0, g1)))
+    plain = fuse(a, b, motions, CanonicalConfig())
+    shares = torch.full((len(g0),), 0.5)
+    none = fuse(a, b, motions, CanonicalConfig(), (shares, shares))
+    some = fuse(a, b, motions, CanonicalConfig(), (torch.where(lone, 0.9, shares),) * 2)
+    assert len(none.gaussians) == len(g0) and len(plain.gaussians) == len(g0) + 20
+    assert len(some.gaussians) == len(plain.gaussians)
+
+
 def test_the_papers_letter_keeps_the_chords():
     g0, g1, motions = door_and_wall()
     fused = fuse(g0, g1, None, CanonicalConfig(beta="global", match_size=500))

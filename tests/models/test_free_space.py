@@ -4,7 +4,7 @@ import torch
 from tiny import look_at
 
 from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.free_space import explain_by_free_space
+from p2gs.models.free_space import explain_by_free_space, hidden_share
 
 
 def wall_stack(x: float) -> DepthStack:
@@ -33,3 +33,27 @@ def test_a_wall_that_slid_back():
     # on the wall and moving with it; on it but called static; before it in both states; hidden behind it in both
     assert found.tolist()[:2] == [1, 1] and keep.tolist() == [True, True, False, True]
     assert found[3] == 1
+
+
+def test_hidden_share_against_the_literal_count():
+    """Points carried by their label's motion; for each camera: is the wall nearer than the point?"""
+    stack = wall_stack(0.5)
+    T = torch.eye(4).double()[None]
+    T[0, 1, 3] = -0.4
+    gen = torch.Generator().manual_seed(1)
+    means = torch.rand(60, 3, generator=gen) - torch.tensor([0.5, 0.0, 0.5])
+    labels = torch.randint(0, 2, (60,), generator=gen)
+    found = hidden_share(means, labels, T, stack, 0.02)
+    for i in range(60):
+        at = means[i] + (torch.tensor([0.0, -0.4, 0.0]) if labels[i] else 0)
+        votes = []
+        for camera in stack.cameras:
+            local = camera.viewmat[:3, :3] @ at + camera.viewmat[:3, 3]
+            x, y = ((camera.K @ local)[:2] / local[2]).tolist()
+            if local[2] > 0 and 1 <= x < 63 and 1 <= y < 63:
+                way = at - camera.position
+                wall = local[2] * (0.5 - camera.position[1]) / way[1]  # depth of the wall on this ray
+                votes.append(bool(local[2] > wall + 0.02))
+        if len(votes) == 5 and abs(float(at[1]) - 0.5) > 0.1:
+            assert abs(float(found[i]) - sum(votes) / 5) < 1e-6
+    assert 0 < float(found.mean()) < 1
