@@ -261,6 +261,7 @@ class Pipeline:
             self.views,
             config,
             self.scene.similarity,
+            self.cfg.phases["articulation"].losses,
             seed=self.cfg.seed,
             backend=self.cfg.rasterizer,
             device=device,

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
+from p2gs.losses.base import Loss
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
@@ -16,6 +17,7 @@ from p2gs.models.joint_range import extend_ranges
 from p2gs.models.phase import PHASES
 from p2gs.models.refine_motions import leave_false_minima, refine, single_ways
 from p2gs.models.screw_polish import PolishConfig, photometric_cost
+from p2gs.models.tune import TuneConfig, tune
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
@@ -26,15 +28,16 @@ class FinishConfig:
     """Options of the last stage.
 
     polish: photometric refinement of the screws with hard labels and frozen Gaussians.  survey: shifts of a part within its own surface
-    that are tried after it (internal units; [] = none).  min_mass: a slot with a smaller share of the
-    solid Gaussians vanishes.  min_motion: likewise one that moves its points by less (internal units).  prismatic_below: a free motion
-    (paper's start) that turns by less than this many degrees is a slide.  clean_neighbours: labels are the majority among this many
-    neighbours at canonical time (0 = as learned).  exports: simulator formats written at the end of a fit, with meshes and report (empty:
-    neither; `p2gs export` makes them later).  extend_range: joint limits go on beyond the observed motion until the part touches another
-    one (half a turn, the object's diagonal at most); off: they are the observed motion.
+    that are tried after it (internal units; [] = none). tune: then the Gaussians once more, with the screws frozen. min_mass: a slot with
+    a smaller share of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
+    prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a slide. clean_neighbours: labels are the
+    majority among this many neighbours at canonical time (0 = as learned). exports: simulator formats written at the end of a fit, with
+    meshes and report (empty: neither; `p2gs export` makes them later). extend_range: joint limits go on beyond the observed motion until
+    the part touches another one (half a turn, the object's diagonal at most); off: they are the observed motion.
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.8))
+    tune: TuneConfig = field(default_factory=TuneConfig)
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     min_mass: float = 0.002
     min_motion: float = 0.01
@@ -138,6 +141,7 @@ def finish(
     views,
     config: FinishConfig,
     similarity: Similarity,
+    losses: dict[str, Loss] | None = None,
     *,
     seed: int,
     backend: str,
@@ -145,7 +149,8 @@ def finish(
 ) -> tuple[ArticulatedObject, list[str], FinishRecord]:
     """The twin, one line for each slot that vanished, and what was measured on the way.
 
-    views: photographs by state.  A part's confidence is ``JointEvidence.confidence`` of its joint.
+    views: photographs by state.  losses: those of the last training phase, for ``tune`` (None: it is left out).  A part's confidence is
+    ``JointEvidence.confidence`` of its joint.
     """
     labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
     alive = surviving_slots(learned, labels, config)
@@ -168,24 +173,25 @@ def finish(
         transforms[k] = constrain(kind, transforms[k], start.mean(0))
     found = [state_labels(learned, labels, s, transforms) for s in states]
     record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive)
+    options = {"seed": seed, "backend": backend, "device": device}
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         level = min(measuring_level(views[s]) for s in (0, 1))
         stacks = [state_depth(state, views[s], level, backend=backend, device=device) for s, state in enumerate(states)]
-        options = {"seed": seed, "backend": backend, "device": device}
         refined = refine(states, motions, views, config.polish, stacks, **options)
         refined, _ = leave_false_minima(states, refined, views, config.polish, stacks, config.survey, **options)
         transforms = refined.transforms
         record.after = transforms
         record.polish = single_ways(states, refined, views, config.polish, stacks, **options)
         measure(record, states, types, views, stacks, level, backend, device)
+    gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
     parts = [Part(0, None, int((labels == 0).sum()))]
     for k, kind in enumerate(types):
         rows = labels == k + 1
-        centre = learned.gaussians.means[rows].double().mean(0)
+        centre = gaussians.means[rows].double().mean(0)
         joint = make_joint(kind, transforms[k], se3.apply(se3.screw_at(transforms[k], -time), centre[None])[0])
         parts.append(Part(k + 1, joint, int(rows.sum()), record.evidence[k].confidence))
-    twin = ArticulatedObject(learned.gaussians, labels, parts, time, similarity)
+    twin = ArticulatedObject(gaussians, labels, parts, time, similarity)
     if config.extend_range:
         twin.parts = extend_ranges(twin)
     return twin, notes, record

@@ -1,0 +1,80 @@
+"""The Gaussians once more, with the final labels and motions held fixed: the photographs of both states decide alone.
+
+While motions are learned the Gaussians bend to whatever they happen to be, and to the terms that teach parts; once both stand, surfaces and
+colours still have to follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from p2gs.data.views import TrainingViews, view_index
+from p2gs.losses.base import Loss, LossInputs, Target
+from p2gs.models.adam import NamedAdam
+from p2gs.models.canonical import carry, with_static
+from p2gs.models.single_state import SplatRates, render_gaussians
+from p2gs.models.splats import Splats
+from p2gs.ops import se3
+from p2gs.types import GaussianTensors
+
+PICTURE_LOSSES = ("render", "alpha", "depth")  # priors on surfaces have had their say, and cost more PSNR here than they gain in shape
+
+
+@dataclass
+class TuneConfig:
+    """Options of the last fit of the Gaussians. steps: over both states, in turn (0 = off).  levels: image sizes (long edge, pixels), of
+    which the last is used."""
+
+    steps: int = 600
+    levels: list[int] = field(default_factory=lambda: [400])
+    rates: SplatRates = field(default_factory=lambda: SplatRates(1e-4, 4e-6, 1.5e-3, 2e-2, 6e-4, 2e-3, 2e-4))
+
+
+def tune(
+    gaussians: GaussianTensors,
+    labels: Tensor,
+    transforms: Tensor,
+    time: float,
+    views: dict[int, TrainingViews],
+    losses: dict[str, Loss],
+    config: TuneConfig,
+    *,
+    seed: int,
+    backend: str = "auto",
+    device: torch.device | str = "cpu",
+) -> GaussianTensors:
+    """The Gaussians (at canonical ``time``) fitted to the photographs of both states under fixed motions.
+
+    labels [N]; transforms [K-1, 4, 4] start -> end; views: photographs by state; losses: of these the ones that hold a picture against a
+    photograph count; without "render" nothing changes.  Returns new Gaussians, detached, on the CPU.
+    """
+    losses = {name: loss for name, loss in losses.items() if name in PICTURE_LOSSES}
+    if config.steps <= 0 or "render" not in losses or len(gaussians) == 0:
+        return gaussians
+    splats, labels = Splats(gaussians).to(device), labels.to(device)
+    motions = [se3.screw_at(with_static(transforms), state - time).to(device) for state in (0, 1)]
+    rates = config.rates.at(0.0)
+    optimizer = NamedAdam([{"params": [getattr(splats, name)], "lr": rate, "name": name} for name, rate in rates.items()], eps=1e-15)
+    cache: dict = {}
+    for step in range(config.steps):
+        state = step % 2
+        rates = config.rates.at(step / config.steps)
+        for group in optimizer.param_groups:
+            group["lr"] = rates[group["name"]]
+        of = views[state]
+        background = torch.rand(3, generator=torch.Generator().manual_seed(seed * 1_000_003 + step))
+        shot = of.get(view_index(seed + 7919 * state + 31, step // 2, len(of)), of.levels.index(config.levels[-1]), background)
+        depth = None if shot.depth is None else shot.depth.to(device)
+        camera, background = shot.camera.to(device), background.to(device)
+        target = Target(shot.image.to(device), shot.alpha.to(device), background, depth)
+        g = splats.tensors()
+        render = render_gaussians(carry(g, labels, motions[state]), camera, background, backend=backend)
+        inputs = LossInputs(step, config.steps, g, render, target, camera, cache=cache)
+        values = [value for value in (loss(inputs) for loss in losses.values()) if value is not None]
+        optimizer.zero_grad(set_to_none=True)
+        sum(values).backward()
+        optimizer.step()
+    return splats.tensors().detach().to("cpu").clone()
