@@ -19,7 +19,7 @@ from p2gs.models.part_choices import settle_types, simplify
 from p2gs.models.phase import PHASES
 from p2gs.models.refine_motions import explanation_cost, leave_false_minima, refine
 from p2gs.models.screw_polish import PolishConfig
-from p2gs.models.settle import label_gaussians, reconsider, settle_labels
+from p2gs.models.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
 from p2gs.types import TwoStateScene, UserError
 
 
@@ -36,6 +36,7 @@ class PartMotionsConfig:
     [] = none).  islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
     surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.  reconsider: each part's motion, and
     one more, is searched again amid the others, refined; missing_penalty: relative image loss by which a part that comes so must win.
+    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
 
     evidence_size: int = 200
@@ -51,6 +52,7 @@ class PartMotionsConfig:
     rounds: int = 2
     reconsider: bool = True
     missing_penalty: float = 0.1
+    min_confidence: float = 0.02
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
 
@@ -115,6 +117,9 @@ def find_part_motions(
         motions, changed = reconsider(found, states, motions, views, config, stacks, limit, **options)
     say("settling labels and motions")
     motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
+    motions, unfounded = drop_unfounded(found, states, motions, views, config, stacks, **options)
+    for part in unfounded:
+        say(f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})")
     motions.diagnostics = {
         "explanation": best[2],
         "photometric_costs": costs,
@@ -124,6 +129,7 @@ def find_part_motions(
         "shifted": shifted,
         "reconsidered": changed,
         "rounds": rounds,
+        "unfounded": unfounded,
         **_plain(found.diagnostics),
     }
     return motions

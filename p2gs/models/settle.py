@@ -12,7 +12,7 @@ from p2gs.models.discovery import Candidate, Discovery, instead_of, relabel
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.islands import settle_islands
-from p2gs.models.part_choices import settle_types
+from p2gs.models.part_choices import settle_types, without_part
 from p2gs.models.refine_motions import explanation_cost, refine
 from p2gs.ops.sh import dc_to_rgb
 
@@ -119,3 +119,21 @@ def settle_labels(
         motions = settle_types(states, best[1], views, config, stacks, **options)
         cost = explanation_cost(states, motions, views, level, backend, device)
     return motions, rounds
+
+
+def drop_unfounded(
+    found: Discovery, states, motions: PartMotions, views, config: PartMotionsConfig, stacks, *, seed: int, backend: str, device="cpu"
+) -> tuple[PartMotions, list[dict]]:
+    """Without the parts whose confidence is below ``min_confidence``, the least first; labels are chosen anew and motions refined.
+
+    A part that only one state shows has a motion that nothing was observed of: it may explain the other state's photographs a little better
+    (by hiding junk), and is no finding. Returns the motions, and type and confidence of each that went.
+    """
+    gone: list[dict] = []
+    while len(motions) and float(motions.confidence.min()) < config.min_confidence:
+        k = int(motions.confidence.argmin())
+        gone.append({"type": motions.types[k], "confidence": float(motions.confidence[k])})
+        motions = _relabelled(found, states, without_part(motions, k, 0))
+    if gone:
+        motions = refine(states, motions, views, config.coarse, stacks, seed=seed, backend=backend, device=device)
+    return motions, gone

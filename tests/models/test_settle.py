@@ -57,3 +57,26 @@ def test_a_further_part_must_win_by_more(scene):
     motions, found, log = scene("prismatic", slide(), [], [(other, "prismatic")], limit=2)
     assert found is motions and [entry["change"] for entry in log] == ["added"]  # no Gaussian is its own, the images stay as they are
     assert scene("prismatic", slide(), [], [(other, "prismatic")], limit=1)[2] == []  # no more parts than allowed
+
+
+def test_a_part_of_which_one_state_shows_nothing_is_dropped(monkeypatch):
+    states, labels, views = two_states(slide())
+    margins, told = [torch.ones(len(labels))] * 2, []
+
+    def relabel(found, transforms, types):
+        told.append(list(types))
+        return SimpleNamespace(motions=[SimpleNamespace(confidence=0.5)] * len(types))
+
+    monkeypatch.setattr(settle, "relabel", relabel)
+    monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
+    config = PartMotionsConfig(coarse=COARSE)
+    options = {"seed": 0, "backend": "auto"}
+    two = PartMotions(["revolute", "prismatic"], torch.stack([hinge(), slide()]), torch.tensor([0.01, 0.4]), [labels * 2] * 2, margins)
+    kept, gone = settle.drop_unfounded(None, states, two, views, config, [None, None], **options)
+    assert kept.types == ["prismatic"] and told == [["prismatic"]]
+    assert gone == [{"type": "revolute", "confidence": pytest.approx(0.01)}]
+    assert float((kept.transforms[0] - slide()).norm()) < 0.01
+    same, gone = settle.drop_unfounded(None, states, kept, views, config, [None, None], **options)
+    assert same is kept and gone == []
+    none, gone = settle.drop_unfounded(None, states, two, views, PartMotionsConfig(min_confidence=0.0), [None, None], **options)
+    assert none is two and gone == []
