@@ -35,8 +35,9 @@ class PartMotionsConfig:
     unless the image loss rises by more than this share.  survey: shifts within its own surface tried for each part (internal units;
     [] = none).  islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
     surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.  reconsider: each part's motion, and
-    one more, is searched again amid the others, refined; missing_penalty: relative image loss by which a part that comes so must win.
-    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
+    one more, is searched again amid the others, refined; missing_penalty, missing_confidence: relative image loss by which a part that
+    comes so must win, and the confidence that it must have.  min_confidence: a part of less confidence is dropped in the end (0 = none
+    is): one of the states shows next to nothing of it.
     """
 
     evidence_size: int = 200
@@ -51,7 +52,8 @@ class PartMotionsConfig:
     islands: float = 0.25
     rounds: int = 2
     reconsider: bool = True
-    missing_penalty: float = 0.1
+    missing_penalty: float = 0.02
+    missing_confidence: float = 0.3
     min_confidence: float = 0.02
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))

@@ -47,7 +47,9 @@ def reconsider(
 
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``); with each every surfel chooses its
     part anew and the states are re-rendered. The best exchange and the best addition are refined; the image loss must fall by
-    ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part.  Returns the motions and what was tried.
+    ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part, which must also keep a confidence of
+    ``missing_confidence`` when labels are chosen anew: junk that one state shows lowers the loss by as much as a small drawer does, but
+    nothing in the other state answers it.  Returns the motions and what was tried.
     """
     options = {"backend": backend, "device": device}
     level, log = config.coarse.levels[-1], []
@@ -68,8 +70,13 @@ def reconsider(
             refined = refine(states, tried, views, config.coarse, stacks, seed=seed, **options)
             reached = cost_of(refined)
             change = "added" if part == len(motions) else "exchanged"
-            log.append({"change": change, "part": part, "type": tried.types[part], "before": cost, "tried": min(costs), "after": reached})
+            entry = {"change": change, "part": part, "type": tried.types[part], "before": cost, "tried": min(costs), "after": reached}
+            log.append(entry)
             rank = reached / (1 - penalty)
+            if change == "added" and rank < cost:
+                entry["confidence"] = float(_relabelled(found, states, refined).confidence[part])
+                if entry["confidence"] < config.missing_confidence:
+                    continue
             if rank < cost and (best is None or rank < best[0]):
                 best = (rank, reached, refined)
         if best is None:

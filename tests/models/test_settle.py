@@ -59,6 +59,22 @@ def test_a_further_part_must_win_by_more(scene):
     assert scene("prismatic", slide(), [], [(other, "prismatic")], limit=1)[2] == []  # no more parts than allowed
 
 
+@pytest.mark.parametrize("confidence", [0.5, 0.1])
+def test_a_further_part_needs_an_answer_in_the_other_state(monkeypatch, confidence):
+    states, labels, views = two_states(slide())
+    margins = [torch.ones(len(labels))] * 2
+    motion = SimpleNamespace(confidence=confidence)
+    # once there is a second part, the moving panel is its
+    monkeypatch.setattr(settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[motion] * len(types)))
+    monkeypatch.setattr(settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins))
+    monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: [(slide(), "prismatic")] if part is None else [])
+    wrong = PartMotions(["revolute"], hinge()[None], torch.ones(1), [labels, labels], margins)
+    config = PartMotionsConfig(coarse=COARSE)
+    found, log = settle.reconsider(None, states, wrong, views, config, [None, None], 2, seed=0, backend="auto")
+    assert log[0]["after"] < 0.9 * log[0]["before"] and log[0]["confidence"] == pytest.approx(confidence)
+    assert found.types == (["revolute", "prismatic"] if confidence > 0.3 else ["revolute"])
+
+
 def test_a_part_of_which_one_state_shows_nothing_is_dropped(monkeypatch):
     states, labels, views = two_states(slide())
     margins, told = [torch.ones(len(labels))] * 2, []
