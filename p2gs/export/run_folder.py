@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from pathlib import Path
 from typing import Sequence
@@ -23,6 +24,7 @@ def write_twin(obj: ArticulatedObject, run_dir: Path | str, scene: TwoStateScene
     """
     run_dir = Path(run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
+    remove_derived(run_dir)
     outer = object_to_input(obj)
     write_splat_ply(run_dir / "splats" / "canonical.ply", outer.gaussians, outer.part_ids)
     for name, t in (("start", 0.0), ("end", 1.0)):
@@ -33,6 +35,15 @@ def write_twin(obj: ArticulatedObject, run_dir: Path | str, scene: TwoStateScene
         with rasterizer_of(run_dir):
             write_media(outer, run_dir / "media", [c.camera for c in cameras], scene_photos(scene, outer))
     write_twin_json(obj, run_dir / "twin.json")
+
+
+def remove_derived(run_dir: Path) -> None:
+    """Remove what was made of an earlier twin: its meshes, files for simulators, report and scores would be taken for the new one's."""
+    for path in (*run_dir.glob("twin.*"), *(run_dir / name for name in ("meshes", "assets", "parts", "report.html", "metrics.json"))):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def complete_run(run_dir: Path | str, formats: Sequence[str] = ("urdf", "mjcf", "glb"), log=print) -> None:

@@ -12,6 +12,7 @@ from p2gs.losses.base import Loss
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
+from p2gs.models.islands import settle_twin_islands
 from p2gs.models.joint_confidence import JointEvidence, measure_joints, measuring_level, state_depth
 from p2gs.models.joint_range import extend_ranges
 from p2gs.models.phase import PHASES
@@ -31,7 +32,8 @@ class FinishConfig:
     that are tried after it (internal units; [] = none). tune: then the Gaussians once more, with the screws frozen. min_mass: a slot with
     a smaller share of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
     prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a slide. clean_neighbours: labels are the
-    majority among this many neighbours at canonical time (0 = as learned). exports: simulator formats written at the end of a fit, with
+    majority among this many neighbours at canonical time (0 = as learned). islands: pieces of a part smaller than this share of its largest
+    go to what they touch (0 = off). exports: simulator formats written at the end of a fit, with
     meshes and report (empty: neither; `p2gs export` makes them later). extend_range: joint limits go on beyond the observed motion until
     the part touches another one (half a turn, the object's diagonal at most); off: they are the observed motion.
     """
@@ -43,6 +45,7 @@ class FinishConfig:
     min_motion: float = 0.01
     prismatic_below: float = 5.0
     clean_neighbours: int = 8
+    islands: float = 0.25
     exports: list[str] = field(default_factory=lambda: ["urdf", "mjcf", "glb"])
     extend_range: bool = False
 
@@ -171,13 +174,18 @@ def finish(
         rows = labels == k + 1
         start = se3.apply(se3.screw_at(transforms[k], -time), learned.gaussians.means[rows].double())
         transforms[k] = constrain(kind, transforms[k], start.mean(0))
+    options = {"backend": backend, "device": device}
+    level = min(measuring_level(views[s]) for s in (0, 1))
+    stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
+    fuller, T = round(time), with_static(transforms)  # the state that shows more
+    posed = carry(learned.gaussians, labels, se3.screw_at(T, fuller - time))
+    away = se3.inverse(T) if fuller else T
+    labels = settle_twin_islands(posed, labels, config.islands, away, stacks[1 - fuller], config.polish.free_static or 0.02)
     found = [state_labels(learned, labels, s, transforms) for s in states]
     record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive)
-    options = {"seed": seed, "backend": backend, "device": device}
+    options["seed"] = seed
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
-        level = min(measuring_level(views[s]) for s in (0, 1))
-        stacks = [state_depth(state, views[s], level, backend=backend, device=device) for s, state in enumerate(states)]
         refined = refine(states, motions, views, config.polish, stacks, **options)
         refined, _ = leave_false_minima(states, refined, views, config.polish, stacks, config.survey, **options)
         transforms = refined.transforms

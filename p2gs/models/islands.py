@@ -7,10 +7,14 @@ Gaussians of them shift a hinge by tenths of a degree.
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from p2gs.models.discovery.evidence import DepthStack
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors
@@ -68,18 +72,62 @@ def settle_islands(states: list[GaussianTensors], labels: list[Tensor], transfor
     out, counts = [], []
     for s in (0, 1):
         T = se3.inverse(transforms) if s else transforms
-        new = _settle(points[s], old[s], island[s], T, points[1 - s], torch.where(island[1 - s] < 0, old[1 - s], -1))
+        lands = partial(_lands, points[s], T, points[1 - s], torch.where(island[1 - s] < 0, old[1 - s], -1))
+        new = _settle(points[s], old[s], island[s], lands)
         counts.append(int((new != old[s]).sum()))
-        nearest = knn(points[s], states[s].means, 1, False)[1][:, 0]
-        follows = (old[s][nearest] == labels[s]) & (new[nearest] != old[s][nearest])  # the faint ones go with the surface they are at
-        lab = torch.where(follows, new[nearest], labels[s])
-        lab[solid[s]] = new
-        out.append(lab)
+        out.append(_with_faint(states[s].means, labels[s], solid[s], new))
     return out, counts
 
 
-def _settle(points: Tensor, labels: Tensor, island: Tensor, T: Tensor, other: Tensor, other_body: Tensor) -> Tensor:
-    """Labels with islands given away. T [K-1, 4, 4] to the other state, whose points are ``other`` and bodies ``other_body`` (-1: none)."""
+@torch.no_grad()
+def settle_twin_islands(g: GaussianTensors, labels: Tensor, share: float, away: Tensor, stack: DepthStack, tau: float) -> Tensor:
+    """Labels [N] of a twin, posed in one state, with islands given to what they touch there.
+
+    The twin holds what both states show of a part: a piece that hangs apart from it here has no counterpart elsewhere to speak for it. It
+    stays nevertheless where the other state's cameras would see through more of it under the new label than under the old.
+    away [K, 4, 4]: motions to the other state, slot 0 included; stack: its rendered depth; tau: tolerance along the ray (scene units).
+    """
+    rows = (torch.sigmoid(g.opacity_logits) > SOLID).nonzero().squeeze(1)
+    if share <= 0 or len(rows) < 10:
+        return labels
+    points, old = g.means[rows], labels[rows]
+
+    def seen_through(piece: Tensor, part: int) -> float:
+        free, on, behind = stack.counts(se3.apply(away[part].to(points), points[piece]), tau)
+        return float((free / (free + on + behind).clamp_min(1)).mean())
+
+    def fits(piece: Tensor, part: int) -> bool:
+        return seen_through(piece, part) <= seen_through(piece, int(old[piece[0]])) + 0.02
+
+    return _with_faint(g.means, labels, rows, _settle(points, old, find_islands(points, old, share), fits=fits))
+
+
+def _with_faint(means: Tensor, labels: Tensor, rows: Tensor, new: Tensor) -> Tensor:
+    """Labels [N] where the solid Gaussians ``rows`` have ``new`` ones; the faint ones go with the surface that they are at."""
+    old = labels[rows]
+    nearest = knn(means[rows], means, 1, False)[1][:, 0]
+    follows = (old[nearest] == labels) & (new[nearest] != old[nearest])
+    out = torch.where(follows, new[nearest], labels)
+    out[rows] = new
+    return out
+
+
+def _lands(points: Tensor, T: Tensor, other: Tensor, other_body: Tensor, rows: Tensor, part: int, spacing: Tensor) -> bool:
+    """Whether the part's motion T[part - 1] lays most of ``points[rows]`` on the body of the same part among the other state's points
+    ``other`` (``other_body``: their labels, -1 for islands)."""
+    distance, index = knn(other, se3.apply(T[part - 1].to(points), points[rows]), 1, False)
+    return bool(((distance[:, 0] < NEAR * spacing) & (other_body[index[:, 0]] == part)).float().mean() > 0.5)
+
+
+def _settle(
+    points: Tensor,
+    labels: Tensor,
+    island: Tensor,
+    lands: Callable[[Tensor, int, Tensor], bool] | None = None,
+    fits: Callable[[Tensor, int], bool] | None = None,
+) -> Tensor:
+    """Labels with islands given away. lands: whether one (rows, part, spacing of the points) is none, by the other state; fits: whether
+    one (rows) may go to a part."""
     labels = labels.clone()
     main = (island < 0).nonzero().squeeze(1)
     if len(main) < 10:
@@ -87,13 +135,10 @@ def _settle(points: Tensor, labels: Tensor, island: Tensor, T: Tensor, other: Te
     spacing = knn(points, None, 1, True)[0].median().clamp_min(1e-6)
     for piece in island[island >= 0].unique().tolist():
         rows = (island == piece).nonzero().squeeze(1)
-        part = int(labels[rows[0]])
-        distance, index = knn(other, se3.apply(T[part - 1].to(points), points[rows]), 1, False)
-        lands = (distance[:, 0] < NEAR * spacing) & (other_body[index[:, 0]] == part)
-        if lands.float().mean() > 0.5:
+        if lands is not None and lands(rows, int(labels[rows[0]]), spacing):
             continue
         distance, index = knn(points[main], points[rows], 8, False)
         touched = labels[main][index][distance < 2 * NEAR * spacing]
-        if len(touched):
+        if len(touched) and (fits is None or fits(rows, int(touched.mode().values))):
             labels[rows] = touched.mode().values
     return labels

@@ -35,9 +35,9 @@ class PartMotionsConfig:
     unless the image loss rises by more than this share.  survey: shifts within its own surface tried for each part (internal units;
     [] = none).  islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
     surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.  reconsider: each part's motion, and
-    one more, is searched again amid the others, refined; missing_penalty, missing_confidence: relative image loss by which a part that
-    comes so must win, and the confidence that it must have.  min_confidence: a part of less confidence is dropped in the end (0 = none
-    is): one of the states shows next to nothing of it.
+    one more, is searched again amid the others, refined; missing_penalty: relative image loss by which a part that comes so must win;
+    missing_confidence, missing_evidence: confidence and evidence that it must have (``reconsider``).  min_confidence: a part of less
+    confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
 
     evidence_size: int = 200
@@ -54,6 +54,7 @@ class PartMotionsConfig:
     reconsider: bool = True
     missing_penalty: float = 0.02
     missing_confidence: float = 0.3
+    missing_evidence: float = 0.005
     min_confidence: float = 0.02
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))

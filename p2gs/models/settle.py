@@ -12,6 +12,7 @@ from p2gs.models.discovery import Candidate, Discovery, instead_of, relabel
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.islands import settle_islands
+from p2gs.models.joint_confidence import measure_joints, measuring_level
 from p2gs.models.part_choices import settle_types, without_part
 from p2gs.models.refine_motions import explanation_cost, refine
 from p2gs.ops.sh import dc_to_rgb
@@ -47,9 +48,10 @@ def reconsider(
 
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``); with each every surfel chooses its
     part anew and the states are re-rendered. The best exchange and the best addition are refined; the image loss must fall by
-    ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part, which must also keep a confidence of
-    ``missing_confidence`` when labels are chosen anew: junk that one state shows lowers the loss by as much as a small drawer does, but
-    nothing in the other state answers it.  Returns the motions and what was tried.
+    ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part. Junk lowers the loss by as much as a small door does:
+    with labels chosen anew, a further part's surface must also be found in both states (discovery's confidence at least
+    ``missing_confidence``) and the photographs must hold its joint where it is (``JointEvidence.confidence`` at least
+    ``missing_evidence``).  Returns the motions and what was tried.
     """
     options = {"backend": backend, "device": device}
     level, log = config.coarse.levels[-1], []
@@ -74,8 +76,11 @@ def reconsider(
             log.append(entry)
             rank = reached / (1 - penalty)
             if change == "added" and rank < cost:
-                entry["confidence"] = float(_relabelled(found, states, refined).confidence[part])
-                if entry["confidence"] < config.missing_confidence:
+                own = _relabelled(found, states, refined)
+                size = min(measuring_level(views[s]) for s in (0, 1))
+                evidence = measure_joints(states, own.labels, own.transforms, own.types, views, stacks, level=size, **options)
+                entry |= {"confidence": float(own.confidence[part]), "evidence": evidence[part].confidence}
+                if entry["confidence"] < config.missing_confidence or entry["evidence"] < config.missing_evidence:
                     continue
             if rank < cost and (best is None or rank < best[0]):
                 best = (rank, reached, refined)

@@ -36,6 +36,17 @@ def read(path):
     return cv2.imread(str(path))[..., ::-1].astype(float) / 255
 
 
+def test_a_new_twin_removes_what_was_made_of_the_old_one(tmp_path):
+    old = ["twin.urdf", "twin.glb", "meshes/start/part_7.ply", "assets/a.obj", "metrics.json", "report.html"]
+    kept = ["config.yaml", "checkpoints/articulation.pt", "notes.txt"]
+    for name in old + kept:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("old")
+    write_twin(toy_twin(SIM), tmp_path, toy_scene(SIM, n=2, size=16), media=False)
+    assert not any((tmp_path / name).exists() for name in old)
+    assert all((tmp_path / name).read_text() == "old" for name in kept) and (tmp_path / "twin.json").exists()
+
+
 def test_write_twin_leaves_the_contract(run):
     names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
     media = {"start", "end", "parts_start", "parts_end", "states", "compare", *(f"parts_t{t:03d}" for t in (0, 25, 50, 75, 100))}

@@ -59,11 +59,12 @@ def test_a_further_part_must_win_by_more(scene):
     assert scene("prismatic", slide(), [], [(other, "prismatic")], limit=1)[2] == []  # no more parts than allowed
 
 
-@pytest.mark.parametrize("confidence", [0.5, 0.1])
-def test_a_further_part_needs_an_answer_in_the_other_state(monkeypatch, confidence):
+@pytest.mark.parametrize(("confidence", "evidence", "taken"), [(0.5, 0.1, True), (0.1, 0.1, False), (0.5, 0.0, False)])
+def test_a_further_part_must_be_found_in_both_states_and_held(monkeypatch, confidence, evidence, taken):
     states, labels, views = two_states(slide())
     margins = [torch.ones(len(labels))] * 2
     motion = SimpleNamespace(confidence=confidence)
+    monkeypatch.setattr(settle, "measure_joints", lambda *a, **o: [SimpleNamespace(confidence=evidence)] * 2)
     # once there is a second part, the moving panel is its
     monkeypatch.setattr(settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[motion] * len(types)))
     monkeypatch.setattr(settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins))
@@ -72,7 +73,7 @@ def test_a_further_part_needs_an_answer_in_the_other_state(monkeypatch, confiden
     config = PartMotionsConfig(coarse=COARSE)
     found, log = settle.reconsider(None, states, wrong, views, config, [None, None], 2, seed=0, backend="auto")
     assert log[0]["after"] < 0.9 * log[0]["before"] and log[0]["confidence"] == pytest.approx(confidence)
-    assert found.types == (["revolute", "prismatic"] if confidence > 0.3 else ["revolute"])
+    assert found.types == (["revolute", "prismatic"] if taken else ["revolute"]) and log[0]["evidence"] == evidence
 
 
 def test_a_part_of_which_one_state_shows_nothing_is_dropped(monkeypatch):
