@@ -28,14 +28,14 @@ from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similari
 class FinishConfig:
     """Options of the last stage.
 
-    polish: photometric refinement of the screws with hard labels and frozen Gaussians.  survey: shifts of a part within its own surface
+    polish: photometric refinement of the screws with hard labels and frozen Gaussians. survey: shifts of a part within its own surface
     that are tried after it (internal units; [] = none). tune: then the Gaussians once more, with the screws frozen. min_mass: a slot with
     a smaller share of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
     prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a slide. clean_neighbours: labels are the
-    majority among this many neighbours at canonical time (0 = as learned). islands: pieces of a part smaller than this share of its largest
-    go to what they touch (0 = off). exports: simulator formats written at the end of a fit, with
-    meshes and report (empty: neither; `p2gs export` makes them later). extend_range: joint limits go on beyond the observed motion until
-    the part touches another one (half a turn, the object's diagonal at most); off: they are the observed motion.
+    majority among this many neighbours at canonical time (0 = as learned). islands: pieces of a part smaller than this share of its
+    largest go to what they touch (0 = off). exports: simulator formats written at the end of a fit, with meshes and report (empty:
+    neither; `p2gs export` makes them later). extend_range: joint limits go on beyond the observed motion until the part touches another
+    one (half a turn, the object's diagonal at most); off: they are the observed motion.
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.8))

@@ -7,7 +7,7 @@ from tiny import hinge, look_at, slide
 
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import PartMotions
-from p2gs.models.islands import find_islands, pieces, settle_islands
+from p2gs.models.islands import find_islands, pieces, settle_islands, settle_twin_islands
 from p2gs.models.refine_motions import leave_false_minima, survey
 from p2gs.models.screw_polish import PolishConfig, facing
 from p2gs.ops import se3
@@ -123,3 +123,20 @@ def test_survey_leaves_a_false_minimum(kind, truth):
     better, which = leave_false_minima(states, motions, views, config, stacks, [0.06, 0.12], seed=0, backend="auto")
     assert which == [0] and float((better.transforms[0, :3, 3] - truth[:3, 3]).norm()) < 0.02
     assert leave_false_minima(states, motions, views, config, stacks, [], seed=0, backend="auto") == (motions, [])
+
+
+@pytest.mark.parametrize("wall_in_front", [True, False])
+def test_a_twins_island_goes_to_what_it_touches_unless_that_is_seen_through(wall_in_front):
+    """A patch amid the base is labelled as the part; the other state's camera sees a wall before it all, or looks past everything."""
+    base, part = sheet([0.0, 0, 0]), sheet([0.0, 0, 1.0])
+    points = torch.cat([base, part])
+    right = torch.tensor([0] * 400 + [1] * 400)
+    wrong = right.clone()
+    wrong[150:160] = 1
+    away = torch.stack([torch.eye(4).double(), push(-2.0)])  # the part's motion hides what has its label
+    camera = look_at(torch.tensor([3.0, 0.0, 0.0]), 32)
+    depth = torch.full((32, 32), 2.0 if wall_in_front else 4.0)
+    stack = DepthStack([depth] * 3, [torch.ones(32, 32)] * 3, [camera] * 3)
+    found = settle_twin_islands(solid(points), wrong, 0.25, away, stack, 0.02)
+    assert torch.equal(found, right if wall_in_front else wrong)
+    assert settle_twin_islands(solid(points), wrong, 0.0, away, stack, 0.02) is wrong
