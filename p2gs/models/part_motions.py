@@ -45,7 +45,7 @@ class PartMotionsConfig:
     candidates: int = 3
     compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
-    part_penalty: float = 0.006
+    part_penalty: float = 0.02
     same_motion: float = 0.04
     merge_penalty: float = 0.012
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
