@@ -50,15 +50,22 @@ def simplify(
 def _reductions(states, motions: PartMotions, same_motion: float):
     """Explanations with one part less: (what changed, motions). Merging comes first, small parts go before large ones."""
     solid = [torch.sigmoid(s.gaussians.opacity_logits) > 0.5 for s in states]
-    points = [states[0].gaussians.means[solid[0] & (motions.labels[0] == k + 1)].double() for k in range(len(motions))]
-    order = sorted(range(len(motions)), key=lambda k: len(points[k]))
+    points = [
+        [s.gaussians.means[of & (lab == k + 1)].double() for s, of, lab in zip(states, solid, motions.labels, strict=True)]
+        for k in range(len(motions))
+    ]
+    order = sorted(range(len(motions)), key=lambda k: len(points[k][0]))
     for i, small in enumerate(order):
         for large in reversed(order[i + 1 :]):
-            if min(len(points[small]), len(points[large])) < 5:
-                continue
-            gap = se3.apply(motions.transforms[small], points[small]) - se3.apply(motions.transforms[large], points[small])
-            if float(gap.norm(dim=1).mean()) < same_motion and _touch(points[small], points[large]):
-                yield ("merge", small, large), without_part(motions, small, large + 1)
+            # each state by itself: what one hides of a part (the inside of a shut drawer) the other shows
+            for a, b, back in ((points[small][0], points[large][0], False), (points[small][1], points[large][1], True)):
+                if min(len(a), len(b)) < 5:
+                    continue
+                ways = [se3.inverse(motions.transforms[k]) if back else motions.transforms[k] for k in (small, large)]
+                gap = se3.apply(ways[0], a) - se3.apply(ways[1], a)
+                if float(gap.norm(dim=1).mean()) < same_motion and _touch(a, b):
+                    yield ("merge", small, large), without_part(motions, small, large + 1)
+                    break
     for small in order:
         yield ("drop", small), without_part(motions, small, 0)
 

@@ -118,6 +118,7 @@ def find_part_motions(
         say("reconsidering each part")
         limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
         motions, changed = reconsider(found, states, motions, views, config, stacks, limit, **options)
+        motions = simplify(states, motions, views, config, backend=backend, device=device, log=changed)
     say("settling labels and motions")
     motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
     motions, unfounded = drop_unfounded(found, states, motions, views, config, stacks, **options)

@@ -68,6 +68,10 @@ def test_one_part_cut_in_two_becomes_one_and_a_true_part_stays():
     config = PartMotionsConfig(coarse=PolishConfig(levels=[64], level_starts=[0.0]))
     simple = simplify(states, motions, views, config, backend="auto")
     assert len(simple) == 1 and torch.equal(simple.labels[0], labels)
+    # the start hides one of the pieces: that they touch shows in the end
+    half = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [labels, cut], [torch.ones(len(cut))] * 2)
+    simple = simplify(states, half, views, config, backend="auto")
+    assert len(simple) == 1 and torch.equal(simple.labels[1], labels)
 
 
 def test_empty_and_unmoving_slots_vanish_with_a_word():
