@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from p2gs.models.canonical import with_static
 from p2gs.models.discovery.evidence import DepthStack, classify
 from p2gs.ops import se3
 
@@ -65,6 +66,6 @@ def hidden_share(means: Tensor, labels: Tensor, transforms: Tensor, stack: Depth
     means [N, 3]; labels [N]; transforms [K-1, 4, 4] to the other state; stack: rendered depth of the other state; tau: tolerance along the
     ray (scene units). Views that do not contain a Gaussian say nothing; 0 where none does.
     """
-    T = torch.cat([torch.eye(4, dtype=transforms.dtype)[None], transforms]).to(means)[labels]
+    T = with_static(transforms).to(means)[labels]
     free, on, behind = stack.counts((T[:, :3, :3] * means[:, None]).sum(-1) + T[:, :3, 3], tau)
     return behind / (free + on + behind).clamp_min(1)

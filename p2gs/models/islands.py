@@ -139,6 +139,9 @@ def _settle(
             continue
         distance, index = knn(points[main], points[rows], 8, False)
         touched = labels[main][index][distance < 2 * NEAR * spacing]
-        if len(touched) and (fits is None or fits(rows, int(touched.mode().values))):
-            labels[rows] = touched.mode().values
+        if not len(touched):
+            continue
+        part = int(touched.mode().values)
+        if fits is None or fits(rows, part):
+            labels[rows] = part
     return labels
