@@ -11,6 +11,7 @@
 #include "blend.h"
 #include "image.h"
 #include "knn.h"
+#include "landing.h"
 #include "raster.h"
 #include "ssim.h"
 
@@ -24,6 +25,7 @@ struct Kernels {
     SsimKernels ssim;
     RasterKernels raster;
     KnnKernels knn;
+    LandingKernels landing;
 };
 
 namespace avx512 { extern const Kernels table; }

@@ -76,4 +76,5 @@ NB_MODULE(_native, m) {
     bind_ssim(m);
     bind_raster(m);
     bind_knn(m);
+    bind_landing(m);
 }

@@ -10,7 +10,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.discovery.rigid import Motions
 from p2gs.models.discovery.surfels import Surfels
+from p2gs.native import native, num_threads
 
 
 def normal_code(n: Tensor) -> Tensor:
@@ -23,6 +25,11 @@ def code_directions() -> Tensor:
     """[27, 3] unit vectors of the patterns (zero for pattern 13)."""
     g = torch.stack(torch.meshgrid(*[torch.arange(-1.0, 2.0)] * 3, indexing="ij"), -1).reshape(27, 3)
     return g / g.norm(dim=1, keepdim=True).clamp_min(1e-9)
+
+
+def surfel_rows(surfels: Surfels, static: Tensor) -> Tensor:
+    """[N, 12] as the kernels read surfels: point, normal, colour, static [N] as 0 or 1, two zeros."""
+    return torch.cat([surfels.points, surfels.normals, surfels.colours, static[:, None], torch.zeros(len(surfels), 2)], 1).float()
 
 
 @dataclass
@@ -57,6 +64,7 @@ class Landing:
         self.hc = 2 * self.h
         self.coarse = ((hi - lo) / self.hc).ceil().long() + 1
         self.nearest = self._nearest()
+        self.rows = surfel_rows(surfels, static)
 
     def _centres(self, size: Tensor, h: float) -> Tensor:
         axes = [torch.arange(int(s)) * h + float(o) + h / 2 for s, o in zip(size, self.lo, strict=False)]
@@ -113,3 +121,37 @@ class Landing:
         taken = self.static[j].float() if claimed is None else torch.maximum(self.static[j].float(), claimed[j])
         cost = cost + self.ON_STATIC * taken
         return torch.minimum(cost, self.open(x)).clamp_max(1), j
+
+    def arrive(
+        self, motions: Motions, source: "Landing", index: Tensor, back: bool = False, claimed: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Cost [B, P] and matched surfel [B, P] of the surfels ``index`` [P] of the other state, ``source``, carried here by motions or,
+        ``back``, by their inverses.  One pass of a kernel where there is one, else ``cost``, which it equals up to rounding."""
+        if not self.fused:
+            s = source.surfels
+            return self.cost(motions.apply(s.points[index], back), motions.rotate(s.normals[index], back), s.colours[index], claimed)
+        index = index.contiguous()
+        cost = torch.empty(len(motions), len(index))
+        met = torch.empty(len(motions), len(index), dtype=torch.long)
+        claimed = None if claimed is None else claimed.float().contiguous()
+        if cost.numel():
+            moving = motions.packed()
+            native.landing_cost(
+                *self.tables(), 0 if claimed is None else claimed.data_ptr(), [m.data_ptr() for m in moving], len(motions), back,
+                source.rows.data_ptr(), len(source.rows), index.data_ptr(), len(index), cost.data_ptr(), met.data_ptr(), num_threads(),
+            )  # fmt: skip
+        return cost, met
+
+    @property
+    def fused(self) -> bool:
+        """Do the kernels know this state's surfels?"""
+        return native is not None and len(self.surfels) > 0 and self.surfels.points.device.type == "cpu"
+
+    def tables(self) -> tuple[list[int], list[float], list[int]]:
+        """This state as the kernels take it: addresses, lengths and costs, grid sizes."""
+        k = self.scale
+        return (
+            [self.nearest.data_ptr(), self.depth_free.data_ptr(), self.rows.data_ptr()],
+            [*self.lo.tolist(), self.h, self.hc, k.tp, k.spacing, self.HIDDEN, self.ON_STATIC],
+            [*self.size.tolist(), *self.coarse.tolist()],
+        )

@@ -44,11 +44,7 @@ class Problem:
 
     def cost(self, motions: Motions, state: int, index: Tensor, claimed: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Landing cost [B, P] of surfels ``index`` of ``state`` under each motion (start by T, end by T^-1), and what they meet."""
-        s = self.surfels[state]
-        back = state == 1
-        return self.landings[1 - state].cost(
-            motions.apply(s.points[index], back), motions.rotate(s.normals[index], back), s.colours[index], claimed
-        )
+        return self.landings[1 - state].arrive(motions, self.landings[state], index, state == 1, claimed)
 
     def pay(self, motions: Motions, samples: list[Tensor] | None = None, chunk: int = 64) -> list[tuple[Tensor, Tensor]]:
         """Evidence [B, P] by state: how much below ``unexplained`` a point costs; only true arrivals on a surface pay. With it, whether
@@ -66,7 +62,7 @@ class Problem:
 
     def loose(self, state: int, index: Tensor) -> Tensor:
         """Are these surfels of ``state`` of unknown fate?"""
-        return ~(self.moved[state][index] | self.static[state][index])
+        return (~(self.moved[state] | self.static[state]))[index]
 
 
 def balanced(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:

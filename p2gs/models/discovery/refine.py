@@ -10,10 +10,29 @@ from torch import Tensor
 
 from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.rigid import Motions
+from p2gs.native import native, num_threads
 
 
 def normal_equations(problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], width: float):
     """J^T W J [B, 5, 5] and J^T W r [B, 5] of both states' point-to-plane residuals, Geman-McClure weights of ``width``."""
+    if not all(landing.fused for landing in problem.landings):
+        return normal_equations_reference(problem, motions, samples, weights, width)
+    A = torch.zeros(len(motions), 5, 5)
+    b = torch.zeros(len(motions), 5)
+    basis, moving = motions.twist_basis().contiguous(), motions.packed()
+    for s in (0, 1):
+        landing, source = problem.landings[1 - s], problem.landings[s]
+        index, w = samples[s].contiguous(), weights[s].float().contiguous()
+        native.landing_fit(
+            *landing.tables(), [m.data_ptr() for m in moving], len(motions), basis.data_ptr(), s == 1, source.rows.data_ptr(),
+            len(source.rows), index.data_ptr(), w.data_ptr(), len(index), width, landing.hc + 2 * problem.scale.spacing, A.data_ptr(),
+            b.data_ptr(), num_threads(),
+        )  # fmt: skip
+    return A, b
+
+
+def normal_equations_reference(problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], width: float):
+    """``normal_equations`` in torch, for machines without the kernels."""
     B = motions.twist_basis()
     A = torch.zeros(len(motions), 5, 5)
     b = torch.zeros(len(motions), 5)

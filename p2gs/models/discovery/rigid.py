@@ -48,6 +48,10 @@ class Motions:
     def empty() -> "Motions":
         return Motions(torch.zeros(0, dtype=torch.bool), torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
 
+    def packed(self) -> list[Tensor]:
+        """turn, axis, centre, amount as the kernels take them, contiguous; the caller keeps them while their addresses are in use."""
+        return [self.turn.contiguous(), *(x.float().contiguous() for x in (self.axis, self.centre, self.amount))]
+
     def matrices(self) -> tuple[Tensor, Tensor]:
         """R [B, 3, 3], t [B, 3]."""
         R = rotation(self.axis, torch.where(self.turn, self.amount, torch.zeros_like(self.amount)))

@@ -1,0 +1,172 @@
+"""The kernels of discovery against their twins in torch."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from p2gs.models.discovery.config import DiscoveryConfig
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.discovery.fields import Landing, Scale
+from p2gs.models.discovery.problem import Problem
+from p2gs.models.discovery.refine import normal_equations, normal_equations_reference
+from p2gs.models.discovery.rigid import Motions
+from p2gs.models.discovery.surfels import Surfels
+
+
+class NoViews(DepthStack):
+    """Half of space is seen to be free, without any cameras."""
+
+    def __init__(self):
+        pass
+
+    def spread(self, n):
+        return torch.arange(0)
+
+    def counts(self, points, tau, views=None, chunk=0):
+        free = 5.0 * (points[:, 0] > 0.1)
+        return free, torch.zeros_like(free), torch.zeros_like(free)
+
+
+def surfels(n: int, seed: int) -> Surfels:
+    """A rough box, faces outwards."""
+    g = torch.Generator().manual_seed(seed)
+    face = torch.arange(n) % 6
+    p = torch.rand(n, 3, generator=g) - 0.5
+    normals = torch.eye(3)[face % 3] * torch.where(face < 3, 1.0, -1.0)[:, None]
+    p[torch.arange(n), face % 3] = torch.where(face < 3, 0.5, -0.5)
+    normals = torch.nn.functional.normalize(normals + 0.1 * torch.randn(n, 3, generator=g), dim=1)
+    return Surfels(p + 0.003 * torch.randn(n, 3, generator=g), normals, torch.rand(n, 3, generator=g), 0.05, 0.004)
+
+
+def make_problem(n: int = 700, cells: float = 6000.0) -> Problem:
+    both = [surfels(n, s) for s in (0, 1)]
+    lo, hi = torch.full((3,), -0.55), torch.full((3,), 0.56)
+    scale = Scale(tau=0.02, tp=0.02, spacing=0.05, diag=1.9)
+    static = [torch.arange(n) % 3 == s for s in (0, 1)]
+    moved = [torch.arange(n) % 3 == 2 for _ in (0, 1)]
+    landings = [Landing(both[s], static[s], NoViews(), lo, hi, scale, cells) for s in (0, 1)]
+    samples = [torch.nonzero(m)[:, 0] for m in moved]
+    weights = [torch.rand(len(s)) / len(s) for s in samples]
+    trust = [torch.ones(n) for _ in (0, 1)]
+    return Problem(
+        DiscoveryConfig(), scale, [], both, moved, static, landings, samples, weights, trust, torch.zeros(3), [~m & False for m in moved]
+    )
+
+
+def make_motions(n: int, reach: float = 0.6) -> Motions:
+    """Turns and slides, the first ones small: the rest lands partly outside the grids."""
+    amount = torch.linspace(0.01, reach, n) * torch.where(torch.arange(n) % 3 == 0, -1.0, 1.0)
+    axis = torch.nn.functional.normalize(torch.randn(n, 3), dim=1)
+    return Motions(torch.arange(n) % 2 == 0, axis, torch.rand(n, 3) - 0.5, amount)
+
+
+def twin(problem: Problem, motions: Motions, state: int, index, claimed=None):
+    s, back = problem.surfels[state], state == 1
+    x, n = motions.apply(s.points[index], back), motions.rotate(s.normals[index], back)
+    return problem.landings[1 - state].cost(x, n, s.colours[index], claimed)
+
+
+def assert_alike(problem: Problem, motions: Motions, state: int, index, claimed=None):
+    """Rounding may carry a point into the next voxel, and there it may meet another surfel."""
+    cost, met = problem.cost(motions, state, index, claimed)
+    expected, surfel = twin(problem, motions, state, index, claimed)
+    assert cost.dtype == torch.float32 and met.dtype == torch.int64 and cost.shape == met.shape == (len(motions), len(index))
+    same = met == surfel
+    close = (cost - expected).abs() < 2e-4
+    if cost.numel():
+        assert float(same.float().mean()) > 0.998
+        assert float(close.float().mean()) > 0.998
+
+
+@pytest.mark.parametrize("B, P", [(1, 1), (1, 700), (3, 17), (9, 300), (40, 64), (20, 600)])
+@pytest.mark.parametrize("claimed", [False, True])
+def test_landing_cost_against_torch(isa, threads, B, P, claimed):
+    problem = make_problem()
+    index = torch.randperm(700)[:P]
+    for state in (0, 1):
+        for reach in (0.02, 0.6, 30.0):
+            assert_alike(problem, make_motions(B, reach), state, index, torch.rand(700) if claimed else None)
+
+
+def test_landing_cost_spans_its_range(isa):
+    """The twins agree about something: all kinds of landings are among those compared."""
+    problem = make_problem()
+    cost, _ = problem.cost(make_motions(30), 0, torch.arange(700))
+    assert float(cost.min()) < 0.1 and float(cost.max()) == 1.0 and float(((cost > 0.34) & (cost < 0.36)).float().mean()) > 0.05
+
+
+@pytest.mark.parametrize("B, P", [(0, 5), (5, 0), (0, 0)])
+def test_nothing_to_land(isa, B, P):
+    problem = make_problem(100)
+    cost, met = problem.cost(make_motions(B), 1, torch.arange(P))
+    assert cost.shape == met.shape == (B, P) and met.dtype == torch.int64
+
+
+def test_strided_views_are_taken(isa):
+    problem = make_problem()
+    m = make_motions(1)
+    many = Motions(m.turn.expand(6), m.axis.expand(6, 3), m.centre.expand(6, 3), torch.linspace(-0.1, 0.1, 12)[::2])
+    assert_alike(problem, many, 0, torch.arange(0, 700, 3))
+    assert_alike(problem, many, 0, torch.arange(700)[::5])
+
+
+def test_a_surfel_that_does_not_exist(isa):
+    problem = make_problem(100)
+    for wrong in (100, -1):
+        with pytest.raises(IndexError):
+            problem.cost(make_motions(2), 0, torch.tensor([3, wrong]))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e38])
+def test_what_is_not_finite_stays_within_the_tables(isa, bad):
+    problem = make_problem()
+    motions = make_motions(20)
+    motions.amount[3], motions.centre[5, 1], motions.axis[7, 2] = bad, bad, bad
+    for state in (0, 1):
+        cost, met = problem.cost(motions, state, torch.arange(700))
+        assert bool(((met >= 0) & (met < 700)).all())
+        fine = torch.tensor([i for i in range(20) if i not in (3, 5, 7)])
+        assert bool(cost[fine].isfinite().all()) and bool(((cost >= 0) & (cost <= 1))[fine].all())
+        normal_equations(problem, motions, problem.samples, problem.weights, 0.1)
+
+
+def test_same_bits_for_any_number_of_threads(isa):
+    problem, motions = make_problem(1500), make_motions(37)
+    answers = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        answers.append(
+            [
+                *problem.cost(motions, 0, torch.arange(1500)),
+                *problem.cost(motions[5:6], 1, torch.arange(1500)),
+                *normal_equations(problem, motions, problem.samples, problem.weights, 0.1),
+            ]
+        )
+    for other in answers[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(answers[0], other, strict=True))
+
+
+@pytest.mark.parametrize("width", [0.3, 0.02])
+def test_normal_equations_against_torch(isa, threads, width):
+    """Few enough points that no rounding carries one into the next voxel."""
+    problem, motions = make_problem(), make_motions(11, 0.2)
+    got = normal_equations(problem, motions, problem.samples, problem.weights, width)
+    expected = normal_equations_reference(problem, motions, problem.samples, problem.weights, width)
+    for a, b in zip(got, expected, strict=True):
+        wrong = (a - b).abs().flatten(1).amax(1) > 1e-3 * b.abs().flatten(1).amax(1).clamp_min(1e-6)
+        assert int(wrong.sum()) <= 1
+    assert torch.equal(got[0], got[0].transpose(1, 2)) and float(got[0].abs().max()) > 1e-3
+    none = [torch.zeros(0, dtype=torch.long)] * 2
+    for x in normal_equations(problem, motions, none, [torch.zeros(0)] * 2, width):
+        assert not x.any()
+
+
+def test_torch_takes_over_where_there_are_no_kernels(monkeypatch):
+    problem, motions, index = make_problem(), make_motions(5), torch.arange(300)
+    monkeypatch.setattr("p2gs.models.discovery.fields.native", None)
+    for state in (0, 1):
+        for a, b in zip(problem.cost(motions, state, index), twin(problem, motions, state, index), strict=True):
+            assert torch.equal(a, b)
+    a, b = (f(problem, motions, problem.samples, problem.weights, 0.1) for f in (normal_equations, normal_equations_reference))
+    assert torch.equal(a[0], b[0]) and torch.equal(a[1], b[1])
