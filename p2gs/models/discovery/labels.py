@@ -39,11 +39,17 @@ def softmax(x: Tensor) -> Tensor:
     return torch.softmax(x.T.contiguous(), 0).T.contiguous()
 
 
-def unary(problem: Problem, motions: Motions, state: int, revealed: bool = False) -> Tensor:
+def arrivals(problem: Problem, motions: Motions, state: int) -> tuple[Tensor, Tensor]:
+    """Landing cost [K, N] of every surfel of ``state`` under each motion, and the surfel [K, N] of the other state that it meets."""
+    return problem.cost(motions, state, torch.arange(len(problem.surfels[state])))
+
+
+def unary(problem: Problem, motions: Motions, state: int, revealed: bool = False, landed: tuple[Tensor, Tensor] | None = None) -> Tensor:
     """Cost [N, K + 1] of every surfel of ``state`` under static (column 0) and each motion.
 
     A surfel that a motion lays on a surface known to have moved is wanted there: that surface must come from somewhere.  revealed: what has
     another colour than was there before may have stayed, behind it (for known motions; while they are searched it must be accounted for).
+    landed: ``arrivals`` where they are known already.
     """
     n = len(problem.surfels[state])
     moved, static = problem.moved[state], problem.static[state]
@@ -53,10 +59,8 @@ def unary(problem: Problem, motions: Motions, state: int, revealed: bool = False
     if revealed:
         rest[problem.replaced[state]] = REVEALED
     columns = [rest]
-    index = torch.arange(n)
     wanted = torch.zeros(n, dtype=torch.bool)
-    for k in range(len(motions)):
-        c, j = (x[0] for x in problem.cost(motions[k : k + 1], state, index))
+    for c, j in zip(*(landed or arrivals(problem, motions, state)), strict=True):
         columns.append(c + torch.where(moved, 0.0, 0.06))
         wanted |= (c < 0.2) & problem.moved[1 - state][j]
     columns[0] = torch.where(wanted & ~moved, torch.where(static, 0.2, 0.45), columns[0])
@@ -98,17 +102,15 @@ class Labelling:
 
 def label(problem: Problem, motions: Motions, graphs: list[Graph], agree: int = 2, revealed: bool = False) -> Labelling:
     """Label both states; after a first pass, points pay for landing on a surface that the other state labels differently."""
-    costs = [unary(problem, motions, s, revealed) for s in (0, 1)]
+    landed = [arrivals(problem, motions, s) for s in (0, 1)]
+    costs = [unary(problem, motions, s, revealed, landed[s]) for s in (0, 1)]
     p = [smooth_labels(costs[s], graphs[s]) for s in (0, 1)]
     for _ in range(agree):
         extra = []
         for s in (0, 1):
             add = torch.zeros_like(costs[s])
-            index = torch.arange(len(costs[s]))
-            for k in range(len(motions)):
-                c, j = problem.cost(motions[k : k + 1], s, index)
-                met = c[0] < 0.25
-                add[:, k + 1] = torch.where(met, 0.25 * (1 - p[1 - s][j[0], k + 1]), torch.zeros(()))
+            for k, (c, j) in enumerate(zip(*landed[s], strict=True)):
+                add[:, k + 1] = torch.where(c < 0.25, 0.25 * (1 - p[1 - s][j, k + 1]), torch.zeros(()))
             extra.append(add)
         p = [smooth_labels(costs[s] + extra[s], graphs[s]) for s in (0, 1)]
     return Labelling(p, costs)

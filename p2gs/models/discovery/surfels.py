@@ -30,12 +30,18 @@ class Surfels:
         return Surfels(self.points[index], self.normals[index], self.colours[index], self.spacing, self.noise)
 
 
-def window_planes(stack: DepthStack, view: Tensor, y: Tensor, x: Tensor, reach: float, radius: int = 2):
+def window_planes(stack: DepthStack, view: Tensor, y: Tensor, x: Tensor, reach: float, radius: int = 2, block: int = 8192):
     """Plane through the (2r+1)^2 pixels about each given pixel, pixels farther than ``reach`` in depth faded out.
 
     Returns point [M, 3] (the pixel's ray cut with the plane's mean depth), normal [M, 3] towards the camera, support [M] (pixels), all
     in world coordinates. Solved as a weighted regression of inverse depth, which is exact for a plane seen in perspective.
+    block: pixels at a time, so that what lies between stays in the caches.
     """
+    if len(view) > block:
+        parts = [
+            window_planes(stack, *p, reach, radius, block) for p in zip(view.split(block), y.split(block), x.split(block), strict=True)
+        ]
+        return tuple(torch.cat(p) for p in zip(*parts, strict=True))
     H, W = stack.depth.shape[1:]
     o = torch.arange(-radius, radius + 1)
     dy, dx = [g.reshape(-1) for g in torch.meshgrid(o, o, indexing="ij")]
@@ -47,8 +53,8 @@ def window_planes(stack: DepthStack, view: Tensor, y: Tensor, x: Tensor, reach: 
     w = (inside & stack.valid.reshape(-1)[flat]).float() * torch.exp(-(((z - z0) / reach) ** 2))
     inv = torch.where(z > 0, 1 / z.clamp_min(1e-6), torch.zeros_like(z))
     A = torch.stack([dx.float(), dy.float(), torch.ones(len(dx))], 1)  # [P, 3]
-    M = torch.einsum("mp,pi,pj->mij", w, A, A) + 1e-4 * torch.eye(3)
-    b = torch.einsum("mp,pi,mp->mi", w, A, inv)
+    M = (w @ (A[:, :, None] * A[:, None]).reshape(-1, 9)).reshape(-1, 3, 3) + 1e-4 * torch.eye(3)
+    b = (w * inv) @ A
     g = torch.linalg.solve(M, b)  # 1/z = g0 dx + g1 dy + g2
     K = stack.K[view]
     fx, fy, cx, cy = K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]
@@ -64,13 +70,18 @@ def window_planes(stack: DepthStack, view: Tensor, y: Tensor, x: Tensor, reach: 
     return point, torch.einsum("mij,mi->mj", R, n), w.sum(1), cosine
 
 
-def fuse(stack: DepthStack, cell: float, reach: float, stride: int = 2) -> tuple[Tensor, Tensor, Tensor]:
-    """Average the depth maps in cells of space and facing -> points, normals, number of views that saw the cell."""
-    V, H, W = stack.depth.shape
+def view_planes(stack: DepthStack, reach: float, stride: int = 2) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What the depth maps say of surfaces: points [M, 3], normals [M, 3], the view [M] that saw them and how well [M] it did."""
     v, y, x = torch.nonzero(stack.valid[:, ::stride, ::stride], as_tuple=True)
     point, normal, support, cosine = window_planes(stack, v, y * stride, x * stride, reach)
     keep = (support > 7) & (cosine > 0.2)
-    point, normal, v, weight = point[keep], normal[keep], v[keep], (support * cosine)[keep]
+    return point[keep], normal[keep], v[keep], (support * cosine)[keep]
+
+
+def fuse(planes: tuple[Tensor, Tensor, Tensor, Tensor], cell: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Average ``view_planes`` in cells of space and facing -> points, normals, number of views that saw the cell."""
+    point, normal, v, weight = planes
+    V = int(v.max()) + 1 if len(v) else 1
     side = normal.abs().argmax(1)
     side = side * 2 + (normal.gather(1, side[:, None])[:, 0] > 0)
     lo = point.min(0).values
@@ -82,7 +93,8 @@ def fuse(stack: DepthStack, cell: float, reach: float, stride: int = 2) -> tuple
     total = torch.zeros(n).index_add_(0, inverse, weight)
     points = torch.zeros(n, 3).index_add_(0, inverse, point * weight[:, None]) / total[:, None]
     normals = torch.zeros(n, 3).index_add_(0, inverse, normal * weight[:, None])
-    views = torch.zeros(n).index_add_(0, torch.unique(inverse * V + v) // V, torch.ones(1).expand(len(torch.unique(inverse * V + v))))
+    seen = torch.unique(inverse * V + v) // V
+    views = torch.zeros(n).index_add_(0, seen, torch.ones(len(seen)))
     return points, torch.nn.functional.normalize(normals, dim=1), views
 
 
@@ -100,8 +112,9 @@ def build_surfels(evidence: StateEvidence, stack: DepthStack, diag: float, targe
     """Surfels of one state (at most about ``target``) and the figures of each step. diag: box diagonal; floor: least noise / diag."""
     cell, reach = 0.006 * diag, 0.02 * diag
     stride = 1 if int(stack.valid.sum()) < 12 * target else 2
+    planes = view_planes(stack, reach, stride)
     for _ in range(4):
-        points, normals, views = fuse(stack, cell, reach, stride)
+        points, normals, views = fuse(planes, cell)
         if len(points) < 1.3 * target:
             break
         cell *= (len(points) / target) ** 0.5
