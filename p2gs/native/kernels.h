@@ -9,11 +9,13 @@
 
 #include "adam.h"
 #include "blend.h"
+#include "graph.h"
 #include "image.h"
 #include "knn.h"
 #include "landing.h"
 #include "raster.h"
 #include "ssim.h"
+#include "views.h"
 
 namespace p2gs {
 
@@ -26,6 +28,8 @@ struct Kernels {
     RasterKernels raster;
     KnnKernels knn;
     LandingKernels landing;
+    GraphKernels graph;
+    ViewKernels views;
 };
 
 namespace avx512 { extern const Kernels table; }

@@ -77,4 +77,6 @@ NB_MODULE(_native, m) {
     bind_raster(m);
     bind_knn(m);
     bind_landing(m);
+    bind_graph(m);
+    bind_views(m);
 }

@@ -8,10 +8,12 @@ import torch
 from p2gs.models.discovery.config import DiscoveryConfig
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.discovery.fields import Landing, Scale
+from p2gs.models.discovery.labels import Graph, smooth_labels, smooth_labels_reference
 from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.refine import normal_equations, normal_equations_reference
 from p2gs.models.discovery.rigid import Motions
 from p2gs.models.discovery.surfels import Surfels
+from p2gs.types import Camera
 
 
 class NoViews(DepthStack):
@@ -23,7 +25,7 @@ class NoViews(DepthStack):
     def spread(self, n):
         return torch.arange(0)
 
-    def counts(self, points, tau, views=None, chunk=0):
+    def counts(self, points, tau, views=None):
         free = 5.0 * (points[:, 0] > 0.1)
         return free, torch.zeros_like(free), torch.zeros_like(free)
 
@@ -170,3 +172,80 @@ def test_torch_takes_over_where_there_are_no_kernels(monkeypatch):
             assert torch.equal(a, b)
     a, b = (f(problem, motions, problem.samples, problem.weights, 0.1) for f in (normal_equations, normal_equations_reference))
     assert torch.equal(a[0], b[0]) and torch.equal(a[1], b[1])
+
+
+@pytest.mark.parametrize("columns", [1, 2, 5, 8, 9, 16, 17, 32, 33])
+@pytest.mark.parametrize("n", [2, 37, 1200])
+def test_labels_on_a_graph_against_torch(isa, threads, n, columns):
+    s = surfels(n, 2)
+    graph = Graph(s.points, s.normals, s.colours)
+    cost = torch.rand(n, columns)
+    settings = dict(diffuse=8, rounds=15, pull=2.5, sharp=12.0)
+    torch.testing.assert_close(smooth_labels(cost, graph), smooth_labels_reference(cost, graph, **settings), atol=5e-5, rtol=0)
+    torch.testing.assert_close(graph.average(cost.double()).float(), graph.average(cost), atol=1e-6, rtol=1e-5)
+
+
+def test_labels_are_sure_where_costs_are_far_apart_or_infinite(isa):
+    s = surfels(300, 2)
+    graph = Graph(s.points, s.normals, s.colours)
+    cost = torch.zeros(300, 3)
+    cost[:, 1:] = 1e6
+    assert torch.equal(smooth_labels(cost, graph), torch.eye(3)[0].expand(300, 3))
+    cost[5, 1], cost[9, 0] = float("inf"), float("nan")
+    assert smooth_labels(cost, graph).shape == (300, 3)
+
+
+def test_labels_are_the_same_for_any_number_of_threads(isa):
+    s = surfels(3000, 2)
+    graph, cost, answers = Graph(s.points, s.normals, s.colours), torch.rand(3000, 5), []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        answers.append((smooth_labels(cost, graph), graph.average(cost)))
+    for other in answers[1:]:
+        assert torch.equal(other[0], answers[0][0]) and torch.equal(other[1], answers[0][1])
+
+
+def make_stack(views: int = 6) -> DepthStack:
+    """Rough depth maps with holes, of two sizes, from all around."""
+    cameras, depths, alphas = [], [], []
+    for v in range(views):
+        h, w = ((48, 64), (40, 50))[v % 2]
+        Q, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3], viewmat[2, 3] = Q * torch.sign(torch.linalg.det(Q)), 2.0
+        K = torch.tensor([[60.0, 0, w / 2], [0, 55.0, h / 2], [0, 0, 1]], dtype=torch.float64)
+        cameras.append(Camera(viewmat=viewmat, K=K, width=w, height=h))
+        depths.append(1.5 + torch.rand(h, w))
+        alphas.append((torch.rand(h, w) > 0.2).float())
+    return DepthStack(depths, alphas, cameras)
+
+
+@pytest.mark.parametrize("n", [0, 1, 31, 5000])
+def test_view_counts_against_torch(isa, threads, n):
+    """Rounding may carry a point into the next pixel."""
+    stack, points = make_stack(), torch.randn(n, 3)
+    for views in (torch.arange(6), torch.tensor([4, 1]), torch.arange(0)):
+        got, expected = torch.stack(stack.counts(points, 0.05, views)), torch.stack(stack.counts_reference(points, 0.05, views))
+        assert got.shape == (3, n) and got.dtype == torch.float32
+        if n:
+            assert int((got != expected).any(0).sum()) <= n // 500
+    if n == 5000:
+        assert bool((torch.stack(stack.counts(points, 0.05)).sum(1) > 500).all())
+
+
+def test_view_counts_of_what_is_not_finite(isa):
+    stack, points = make_stack(), torch.randn(40, 3)
+    points[3], points[7, 1], points[20, 2] = float("nan"), float("inf"), -float("inf")
+    points[30] = 3e38
+    free, on, behind = stack.counts(points, 0.05)
+    assert float((free + on + behind)[[3, 7, 20]].sum()) == 0
+    with pytest.raises(IndexError):
+        stack.counts(points, 0.05, torch.tensor([0, 6]))
+
+
+def test_view_counts_are_the_same_for_any_number_of_threads(isa):
+    stack, points, answers = make_stack(), torch.randn(9001, 3), []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        answers.append(torch.stack(stack.counts(points, 0.05)))
+    assert all(torch.equal(a, answers[0]) for a in answers)

@@ -12,6 +12,7 @@ from typing import Optional, Sequence
 import torch
 from torch import Tensor
 
+from p2gs.native import native, num_threads
 from p2gs.types import Camera
 
 
@@ -57,9 +58,12 @@ class DepthStack:
         self.viewmat = torch.stack([c.viewmat for c in cameras]).float()
         self.K = torch.stack([c.K for c in cameras]).float()
         self.position = torch.stack([c.position for c in cameras]).float()
+        R_t = self.viewmat[:, :3].reshape(-1, 12)
+        K = self.K[:, [0, 1, 0, 1], [0, 1, 2, 2]]
+        self.rows = torch.cat([R_t, K, self.size.flip(1)], 1).float().contiguous()  # [V, 18] as the kernel reads cameras
         z = torch.where(self.valid, self.depth, torch.full_like(self.depth, torch.inf))[:, None]
-        self.far = torch.nn.functional.max_pool2d(z, 3, 1, 1)[:, 0]
-        self.near = -torch.nn.functional.max_pool2d(-z, 3, 1, 1)[:, 0]
+        self.far = torch.nn.functional.max_pool2d(z, 3, 1, 1)[:, 0].contiguous()
+        self.near = (-torch.nn.functional.max_pool2d(-z, 3, 1, 1)[:, 0]).contiguous()
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -88,14 +92,28 @@ class DepthStack:
         index = v.clamp(0, H - 1).long() * W + u.clamp(0, W - 1).long()
         return z, index + views * (H * W), inside
 
-    def counts(self, points: Tensor, tau: float, views: Optional[Tensor] = None, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, Tensor]:
+    def counts(self, points: Tensor, tau: float, views: Optional[Tensor] = None) -> tuple[Tensor, Tensor, Tensor]:
         """How many views call each point free (they see past it), on a surface, behind one.  [N] float each.
 
         tau: tolerance along the ray, scene units. Views that do not contain the point say nothing.
+        Raises IndexError for a view that does not exist.
         """
         views = torch.arange(len(self)) if views is None else views
+        if native is None or points.dtype != torch.float32 or points.device.type != "cpu":
+            return self.counts_reference(points, tau, views)
+        if len(views) and not 0 <= int(views.min()) <= int(views.max()) < len(self):
+            raise IndexError(f"views {views.tolist()} of {len(self)}")
+        views, points, out = views.contiguous(), points.contiguous(), torch.empty(3, len(points))
+        native.depth_counts(
+            self.near.data_ptr(), self.far.data_ptr(), self.rows.data_ptr(), *self.depth.shape[1:], views.data_ptr(), len(views), tau,
+            points.data_ptr(), len(points), out.data_ptr(), num_threads(),
+        )  # fmt: skip
+        return out[0], out[1], out[2]
+
+    def counts_reference(self, points: Tensor, tau: float, views: Tensor, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, Tensor]:
+        """``counts`` in torch, ``chunk`` points times views at once."""
         out = points.new_zeros(3, len(points))
-        step = max(1, chunk // len(views))
+        step = max(1, chunk // max(1, len(views)))
         near, far = self.near.reshape(-1), self.far.reshape(-1)
         for i in range(0, len(points), step):
             z, index, inside = self.project(points[i : i + step], views)

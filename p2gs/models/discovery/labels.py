@@ -12,6 +12,7 @@ from torch import Tensor
 
 from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.rigid import Motions
+from p2gs.native import native, num_threads
 
 REVEALED = 0.3  # cost of staying, of what has another colour than was there before: less than hiding (0.35), as it may have been behind
 
@@ -26,12 +27,20 @@ class Graph:
         facing = (normals[j] * normals[:, None]).sum(2).clamp(-1, 1)
         colour = (colours[j] - colours[:, None]).abs().mean(2)
         w = torch.exp(-((d / (1.5 * d[:, -1:].median())) ** 2)) * torch.exp(-1.5 * (1 - facing)) * torch.exp(-4 * colour) + 1e-4
-        w = (w / w.sum(1, keepdim=True)).numpy()
-        self.matrix = csr_matrix((w.reshape(-1), j.numpy().reshape(-1), np.arange(0, n * k + 1, k)), (n, n))
+        self.weights, self.neighbours = (w / w.sum(1, keepdim=True)).contiguous(), j.to(torch.int32).contiguous()  # [N, k] each
+        self.matrix = csr_matrix((self.weights.numpy().reshape(-1), j.numpy().reshape(-1), np.arange(0, n * k + 1, k)), (n, n))
 
     def average(self, values: Tensor) -> Tensor:
         """values [N, K] -> weighted mean over neighbours [N, K]."""
-        return torch.from_numpy(self.matrix @ values.numpy())
+        if native is None or values.dtype != torch.float32:
+            return torch.from_numpy(self.matrix @ values.numpy())
+        values, out = values.contiguous(), torch.empty(values.shape)
+        native.graph_average(*self.tables(), values.data_ptr(), values.shape[1], out.data_ptr(), num_threads())
+        return out
+
+    def tables(self) -> tuple[int, int, int, int]:
+        """The graph as the kernels take it."""
+        return self.neighbours.data_ptr(), self.weights.data_ptr(), *self.neighbours.shape
 
 
 def softmax(x: Tensor) -> Tensor:
@@ -72,6 +81,17 @@ def smooth_labels(cost: Tensor, graph: Graph, diffuse: int = 8, rounds: int = 15
 
     pull: weight of the neighbours' labels.  sharp: probabilities are softmax of -sharp * cost.
     """
+    if native is None or cost.dtype != torch.float32 or not 0 < cost.shape[1] <= native.graph_columns:
+        return smooth_labels_reference(cost, graph, diffuse, rounds, pull, sharp)
+    cost, out = cost.contiguous(), torch.empty(cost.shape)
+    native.graph_labels(
+        *graph.tables(), cost.data_ptr(), cost.shape[1], diffuse, rounds, pull, sharp, out.data_ptr(), num_threads()
+    )  # fmt: skip
+    return out
+
+
+def smooth_labels_reference(cost: Tensor, graph: Graph, diffuse: int, rounds: int, pull: float, sharp: float) -> Tensor:
+    """``smooth_labels`` in torch."""
     smooth = cost
     for _ in range(diffuse):
         smooth = 0.5 * cost + 0.5 * graph.average(smooth)
