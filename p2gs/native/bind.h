@@ -22,6 +22,8 @@ void bind_blend(nb::module_& m);
 void bind_image(nb::module_& m);
 void bind_ssim(nb::module_& m);
 void bind_knn(nb::module_& m);
+void bind_evidence(nb::module_& m);
+void bind_motions(nb::module_& m);
 void bind_graph(nb::module_& m);
 void bind_views(nb::module_& m);
 void bind_landing(nb::module_& m);

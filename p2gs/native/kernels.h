@@ -9,6 +9,7 @@
 
 #include "adam.h"
 #include "blend.h"
+#include "evidence.h"
 #include "graph.h"
 #include "image.h"
 #include "knn.h"
@@ -30,6 +31,7 @@ struct Kernels {
     LandingKernels landing;
     GraphKernels graph;
     ViewKernels views;
+    EvidenceKernels evidence;
 };
 
 namespace avx512 { extern const Kernels table; }

@@ -3,6 +3,8 @@
 
 #include <cstdint>
 
+#include "motions.h"
+
 namespace p2gs {
 
 constexpr int kSurfel = 12;  // floats of a surfel: point, normal, colour, 1 where it is known to be static, two unused
@@ -17,13 +19,6 @@ struct LandingTables {
     float h, hc;              // edges of their voxels, fine and coarse
     float tp, spacing, hidden, on_static;
     int32_t fine[3], coarse[3];  // voxels by axis
-};
-
-// Motions start -> end: turn [B], axis [B, 3], centre [B, 3], amount [B].
-struct MotionBatch {
-    const uint8_t* turn;
-    const float *axis, *centre, *amount;
-    int64_t count;
 };
 
 // Who travels: rows `index` [count] of `surfels` [size].
@@ -48,8 +43,8 @@ struct LandingKernels {
     // matrices: [motion][12], rows of rotation and translation.
     void (*cost)(const LandingTables&, const float* matrices, int64_t first, int64_t last, const Travellers& from, int64_t begin,
                  int64_t end, float* cost, int64_t* met);
-    // Sums over all travellers under one motion. rotation: [9] of start -> end; basis: [6][5] twists by coordinate.
-    void (*fit)(const LandingTables&, const float* matrix, const float* rotation, const float* basis, const Travellers& from,
+    // Sums over all travellers under one motion. forward: as matrix, start -> end; basis: [6][5] twists by coordinate.
+    void (*fit)(const LandingTables&, const float* matrix, const float* forward, const float* basis, const Travellers& from,
                 const PlaneFit& fit, float* sums);
 };
 

@@ -78,5 +78,7 @@ NB_MODULE(_native, m) {
     bind_knn(m);
     bind_landing(m);
     bind_graph(m);
+    bind_evidence(m);
+    bind_motions(m);
     bind_views(m);
 }

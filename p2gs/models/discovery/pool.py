@@ -11,6 +11,7 @@ from torch import Tensor
 
 from p2gs.models.discovery.problem import Problem, balanced
 from p2gs.models.discovery.rigid import Motions
+from p2gs.native import native, num_threads
 
 
 def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples: list[Tensor], slide_bonus: bool = True) -> Tensor:
@@ -22,6 +23,25 @@ def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples
     * Large motions are a little less likely than small ones; a turn has two freedoms more than a slide.
     """
     cfg, k = problem.config, problem.scale
+    sums = joint_sums if all(landing.fused for landing in problem.landings) else joint_sums_reference
+    near, oblique, arm, weight = sums(problem, motions, pays, samples)
+    unseen = 1.5 * k.tau / (2 * torch.sin(motions.amount.abs().clamp(0.03, math.pi) / 2))
+    excess = (near - 0.04 * k.diag - unseen).clamp(0, k.diag)
+    turn = 1 - cfg.attach * (excess / (0.12 * k.diag)).clamp(0, 1)
+    turn = (
+        turn * (1 - 0.15 * ((motions.amount.abs() - math.radians(80)) / math.radians(55)).clamp(0, 1)) * (1 - cfg.slide_bonus * slide_bonus)
+    )
+    size = motions.amount.abs() / (cfg.max_slide * k.diag)
+    slide = (1 - 0.08 * size.clamp(0, 1)) * (1 - 2 * (size - 1).clamp(0, 0.5))
+    out = torch.where(motions.turn, turn, slide)
+    reach = torch.where(motions.turn, arm / weight * motions.amount.abs(), motions.amount.abs())
+    out = out * ((reach / k.tp - 1) / 1.5).clamp(0.1, 1)
+    return out * (1 - torch.where(motions.turn, 0.4, 0.6) * ((oblique / weight - 0.3) / 0.4).clamp(0, 1))
+
+
+def joint_sums_reference(problem: Problem, motions: Motions, pays: list[Tensor], samples: list[Tensor]) -> tuple[Tensor, ...]:
+    """Over the points that each motion pays for, [B] each: distance from its axis to the nearest (but a hundredth of all); shares of
+    oblique normals, mean distance and share of points, both states added."""
     near = torch.full((len(motions),), torch.inf)
     oblique, arm, weight = torch.zeros(len(motions)), torch.zeros(len(motions)), torch.full((len(motions),), 1e-6)
     for s in (0, 1):
@@ -39,18 +59,24 @@ def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples
         along = (axis @ n.T).abs()
         oblique += ((along > 0.3) & (along < 0.95) & pay).float().sum(1) / max(1, len(p))
         weight += pay.float().sum(1) / max(1, len(p))
-    unseen = 1.5 * k.tau / (2 * torch.sin(motions.amount.abs().clamp(0.03, math.pi) / 2))
-    excess = (near - 0.04 * k.diag - unseen).clamp(0, k.diag)
-    turn = 1 - cfg.attach * (excess / (0.12 * k.diag)).clamp(0, 1)
-    turn = (
-        turn * (1 - 0.15 * ((motions.amount.abs() - math.radians(80)) / math.radians(55)).clamp(0, 1)) * (1 - cfg.slide_bonus * slide_bonus)
-    )
-    size = motions.amount.abs() / (cfg.max_slide * k.diag)
-    slide = (1 - 0.08 * size.clamp(0, 1)) * (1 - 2 * (size - 1).clamp(0, 0.5))
-    out = torch.where(motions.turn, turn, slide)
-    reach = torch.where(motions.turn, arm / weight * motions.amount.abs(), motions.amount.abs())
-    out = out * ((reach / k.tp - 1) / 1.5).clamp(0.1, 1)
-    return out * (1 - torch.where(motions.turn, 0.4, 0.6) * ((oblique / weight - 0.3) / 0.4).clamp(0, 1))
+    return near, oblique, arm, weight
+
+
+def joint_sums(problem: Problem, motions: Motions, pays: list[Tensor], samples: list[Tensor]) -> tuple[Tensor, ...]:
+    """``joint_sums_reference`` in one pass of a kernel."""
+    _, axis, centre, _ = motions.packed()
+    near = torch.full((len(motions),), torch.inf)
+    total = torch.zeros(len(motions), 3)
+    for s in (0, 1):
+        rows, index, pay, n = problem.landings[s].rows, samples[s].contiguous(), pays[s].float().contiguous(), len(samples[s])
+        out = torch.empty(len(motions), 4)
+        native.evidence_joints(
+            rows.data_ptr(), len(rows), index.data_ptr(), n, pay.data_ptr(), axis.data_ptr(), centre.data_ptr(), len(motions),
+            min(max(1, int(0.01 * n)), n), out.data_ptr(), num_threads(),
+        )  # fmt: skip
+        total += out[:, :3] / max(1, n)
+        near = torch.minimum(near, out[:, 3])
+    return near, total[:, 1], total[:, 0], total[:, 2] + 1e-6
 
 
 class Pool:
@@ -116,6 +142,20 @@ class Pool:
 
     def effective(self, rows: Tensor, others: list[Tensor]) -> list[Tensor]:
         """Evidence [R, P] of motions ``rows``, less where the landing place is better explained otherwise (``others`` [P] per state)."""
+        if native is None or not all(map(len, others)):
+            return self.effective_reference(rows, others)
+        rows, out = rows.contiguous(), []
+        for s in (0, 1):
+            rival, e = others[1 - s].contiguous(), torch.empty(len(rows), len(self.samples[s]))
+            tables = (self.pays[s], self.back[s], self.twin[s], self.owned[s], rival)
+            native.evidence_effective(
+                [t.data_ptr() for t in tables], e.shape[1], self.RIVAL, self.SHARED, rows.data_ptr(), len(rows), e.data_ptr(), num_threads()
+            )
+            out.append(e)
+        return out
+
+    def effective_reference(self, rows: Tensor, others: list[Tensor]) -> list[Tensor]:
+        """``effective`` in torch."""
         out = []
         for s in (0, 1):
             rival = others[1 - s][self.twin[s][rows]] if len(others[1 - s]) else torch.zeros_like(self.back[s][rows])

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from p2gs.native import native
+
 
 def rotation(axis: Tensor, angle: Tensor) -> Tensor:
     """Rodrigues: axis [..., 3] unit, angle [...] rad -> [..., 3, 3]."""
@@ -54,6 +56,14 @@ class Motions:
 
     def matrices(self) -> tuple[Tensor, Tensor]:
         """R [B, 3, 3], t [B, 3]."""
+        if native is None or self.amount.dtype != torch.float32:
+            return self.matrices_reference()
+        moving, R, t = self.packed(), torch.empty(len(self), 3, 3), torch.empty(len(self), 3)
+        native.motion_matrices([m.data_ptr() for m in moving], len(self), R.data_ptr(), t.data_ptr())
+        return R, t
+
+    def matrices_reference(self) -> tuple[Tensor, Tensor]:
+        """``matrices`` in torch, in the motions' own dtype."""
         R = rotation(self.axis, torch.where(self.turn, self.amount, torch.zeros_like(self.amount)))
         t = torch.where(self.turn[:, None], self.centre - torch.einsum("bij,bj->bi", R, self.centre), self.axis * self.amount[:, None])
         return R, t
@@ -86,6 +96,17 @@ class Motions:
         Turns: angle (rad), tilt about e1, e2 (rad, about the centre), centre along e1, e2.  Slides: amount, sideways e1, e2, -, -.
         Zero pitch and zero rotation hold by construction.
         """
+        if native is None or self.amount.dtype != torch.float32:
+            return self.displaced_reference(step)
+        moving, step = self.packed(), step.float().contiguous()
+        out = Motions(self.turn, torch.empty(len(self), 3), torch.empty(len(self), 3), torch.empty(len(self)))
+        native.motion_displaced(
+            [m.data_ptr() for m in moving], len(self), step.data_ptr(), out.axis.data_ptr(), out.centre.data_ptr(), out.amount.data_ptr()
+        )
+        return out
+
+    def displaced_reference(self, step: Tensor) -> "Motions":
+        """``displaced`` in torch."""
         e1, e2 = perpendicular(self.axis)
         tilt = step[:, 1:2] * e1 + step[:, 2:3] * e2
         angle = tilt.norm(dim=1)

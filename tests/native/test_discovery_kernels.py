@@ -9,6 +9,7 @@ from p2gs.models.discovery.config import DiscoveryConfig
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.discovery.fields import Landing, Scale
 from p2gs.models.discovery.labels import Graph, smooth_labels, smooth_labels_reference
+from p2gs.models.discovery.pool import Pool, joint_sums, joint_sums_reference
 from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.refine import normal_equations, normal_equations_reference
 from p2gs.models.discovery.rigid import Motions
@@ -249,3 +250,42 @@ def test_view_counts_are_the_same_for_any_number_of_threads(isa):
         torch.set_num_threads(threads)
         answers.append(torch.stack(stack.counts(points, 0.05)))
     assert all(torch.equal(a, answers[0]) for a in answers)
+
+
+def test_motions_against_torch():
+    motions = make_motions(40)
+    motions.axis[:6] = torch.eye(3)[[0, 1, 2, 0, 1, 2]]
+    motions.amount[2:4], step = 0.0, torch.randn(40, 5) * 0.2
+    step[3:8] = 0.0
+    for a, b in zip(motions.matrices(), motions.matrices_reference(), strict=True):
+        torch.testing.assert_close(a, b, atol=2e-6, rtol=0)
+    a, b = motions.displaced(step), motions.displaced_reference(step)
+    for name in ("axis", "centre", "amount"):
+        torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=2e-6, rtol=0)
+    assert torch.equal(a.turn, b.turn)
+    assert len(Motions.empty().displaced(torch.zeros(0, 5))) == 0 and len(Motions.empty().matrices()[0]) == 0
+
+
+def test_joints_against_torch(isa, threads):
+    problem, motions = make_problem(), make_motions(33)
+    pays = [p for p, _ in problem.pay(motions)]
+    pays[0][2:9], pays[1][5:12] = 0.0, 0.0
+    for p, samples in ((pays, problem.samples), ([p[:, :7] for p in pays], [s[:7] for s in problem.samples])):
+        for a, b in zip(joint_sums(problem, motions, p, samples), joint_sums_reference(problem, motions, p, samples), strict=True):
+            torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)
+    none, nothing = [torch.zeros(0, dtype=torch.long)] * 2, [torch.zeros(33, 0)] * 2
+    for a, b in zip(joint_sums(problem, motions, nothing, none), joint_sums_reference(problem, motions, nothing, none), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_effective_evidence_against_torch(isa, threads):
+    problem = make_problem()
+    pool = Pool(problem, problem.samples)
+    pool.add(make_motions(30, 0.1))
+    pool.pays = [torch.rand_like(p) for p in pool.pays]
+    pool.back = [torch.rand_like(b) for b in pool.back]
+    pool.owned = [torch.rand_like(p) > 0.5 for p in pool.pays]
+    others = pool.best([3, 5])
+    for rows in (torch.arange(30), torch.tensor([7, 7, 0]), torch.tensor([], dtype=torch.long)):
+        for a, b in zip(pool.effective(rows, others), pool.effective_reference(rows, others), strict=True):
+            torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-5)

@@ -1,0 +1,35 @@
+#include <nanobind/stl/array.h>
+
+#include <array>
+
+#include "bind.h"
+#include "motions.h"
+
+namespace p2gs {
+namespace {
+
+using Motions = std::array<Address, 4>;
+
+MotionBatch batch(const Motions& at, int64_t count) {
+    return {pointer<const uint8_t>(at[0]), pointer<const float>(at[1]), pointer<const float>(at[2]), pointer<const float>(at[3]), count};
+}
+
+}  // namespace
+
+void bind_motions(nb::module_& m) {
+    m.def(
+        "motion_matrices",
+        [](const Motions& motions, int64_t count, Address R, Address t) {
+            motion_matrices(batch(motions, count), pointer<float>(R), pointer<float>(t));
+        },
+        "R [count, 3, 3] and t [count, 3] of motions (turn uint8, axis, centre, amount).");
+    m.def(
+        "motion_displaced",
+        [](const Motions& motions, int64_t count, Address step, Address axis, Address centre, Address amount) {
+            motion_displaced(batch(motions, count), pointer<const float>(step), pointer<float>(axis), pointer<float>(centre),
+                             pointer<float>(amount));
+        },
+        "axis, centre and amount of motions after steps [count, 5] in their own coordinates.");
+}
+
+}  // namespace p2gs
