@@ -20,6 +20,14 @@ void bind_evidence(nb::module_& m) {
         "out [count, points]: rows int64 [count] of pays less what rivals own. addresses: pays, back float32, twin int64, owned uint8 "
         "[B, points], and what rivals pay for the other state's samples.");
     m.def(
+        "evidence_shares",
+        [](Address evidence, Address weights, Address loose, Address rows, int64_t count, int64_t points, Address out) {
+            evidence_shares(pointer<const float>(evidence), pointer<const float>(weights), pointer<const uint8_t>(loose),
+                            pointer<const int64_t>(rows), count, points, pointer<float>(out));
+        },
+        "out [2, count] of evidence [count, points], count > 0: what each row has of the points it pays most for, times weights [points], on "
+        "surfaces of known and of unknown fate; loose uint8 [B, points] of the pool, rows int64 [count].");
+    m.def(
         "evidence_joints",
         [](Address surfels, int64_t size, Address index, int64_t points, Address pays, Address axis, Address centre, int64_t motions,
            int64_t few, Address out, int threads) {

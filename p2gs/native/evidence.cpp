@@ -29,6 +29,18 @@ void evidence_effective(const PoolState& state, const int64_t* rows, int64_t cou
         &context);
 }
 
+void evidence_shares(const float* evidence, const float* weights, const uint8_t* loose, const int64_t* rows, int64_t count,
+                     int64_t points, float* out) {
+    std::vector<double> sums(size_t(count) * 2);
+    for (int64_t p = 0; p < points; ++p) {
+        int64_t who = 0;
+        for (int64_t i = 1; i < count; ++i)
+            if (evidence[i * points + p] > evidence[who * points + p]) who = i;
+        sums[(loose[rows[who] * points + p] ? count : 0) + who] += double(evidence[who * points + p] * weights[p]);
+    }
+    std::copy(sums.begin(), sums.end(), out);
+}
+
 void evidence_joints(const JointPoints& points, int64_t motions, int64_t few, float* out, int threads) {
     for (int64_t i = 0; i < points.count; ++i)
         if (uint64_t(points.index[i]) >= uint64_t(points.size)) throw std::out_of_range("index of a surfel that does not exist");

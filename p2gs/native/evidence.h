@@ -35,6 +35,11 @@ struct EvidenceKernels {
 // out [rows, points]
 void evidence_effective(const PoolState& state, const int64_t* rows, int64_t count, float* out, int threads);
 
+// The set `rows` [count] of a pool with evidence [count, points], points weighted: every point goes to the row that pays most. out
+// [2, count]: by row, what it has on surfaces of known and of unknown fate (loose [B, points]).
+void evidence_shares(const float* evidence, const float* weights, const uint8_t* loose, const int64_t* rows, int64_t count,
+                     int64_t points, float* out);
+
 // out [B, 4]: sums over the points paid for of distance from the axis, oblique normals, points; and the distance that `few` points are
 // within (infinite where fewer pay). Raises std::out_of_range for an index that is none of `size` rows.
 void evidence_joints(const JointPoints& points, int64_t motions, int64_t few, float* out, int threads);

@@ -61,6 +61,32 @@ std::vector<float> motion_rows(const MotionBatch& motions, bool back) {
     return out;
 }
 
+void motion_swept(const MotionBatch& a, const MotionBatch& b, const float* points, int64_t size, float* out) {
+    // mean |D p + d|^2 = tr(D M D^T) + 2 d . D m + d . d, with the points' moments m and M: no pair looks at points
+    double mean[3] = {}, square[3][3] = {};
+    for (int64_t p = 0; p < size; ++p)
+        for (int i = 0; i < 3; ++i) {
+            mean[i] += double(points[3 * p + i]) / size;
+            for (int j = 0; j < 3; ++j) square[i][j] += double(points[3 * p + i]) * points[3 * p + j] / size;
+        }
+    std::vector<Rigid> others(b.count);
+    for (int64_t k = 0; k < b.count; ++k) others[k] = matrix(b, k);
+    for (int64_t i = 0; i < a.count; ++i) {
+        const Rigid one = matrix(a, i);
+        for (int64_t k = 0; k < b.count; ++k) {
+            double total = 0;
+            for (int r = 0; r < 3; ++r) {
+                double D[3], MD[3];
+                const double d = one.t[r] - others[k].t[r];
+                for (int c = 0; c < 3; ++c) D[c] = one.R[r][c] - others[k].R[r][c];
+                for (int c = 0; c < 3; ++c) MD[c] = dot(square[c], D);
+                total += dot(D, MD) + 2 * d * dot(D, mean) + d * d;
+            }
+            out[i * b.count + k] = float(std::sqrt(std::max(total, 0.0)));
+        }
+    }
+}
+
 void motion_displaced(const MotionBatch& motions, const float* step, float* axis_out, float* centre_out, float* amount_out) {
     for (int64_t b = 0; b < motions.count; ++b) {
         const float *a = motions.axis + 3 * b, *s = step + 5 * b;

@@ -19,6 +19,9 @@ void motion_matrices(const MotionBatch& motions, float* R, float* t);
 // The motions after steps [B, 5]: axis [B, 3], centre [B, 3], amount [B].
 void motion_displaced(const MotionBatch& motions, const float* step, float* axis, float* centre, float* amount);
 
+// Root mean square distance [B, C] between the images of points [size, 3] under motions a and b.
+void motion_swept(const MotionBatch& a, const MotionBatch& b, const float* points, int64_t size, float* out);
+
 // Rows of rotation and translation [B][12] of the motions or, back, their inverses.
 std::vector<float> motion_rows(const MotionBatch& motions, bool back);
 

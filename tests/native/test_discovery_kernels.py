@@ -289,3 +289,21 @@ def test_effective_evidence_against_torch(isa, threads):
     for rows in (torch.arange(30), torch.tensor([7, 7, 0]), torch.tensor([], dtype=torch.long)):
         for a, b in zip(pool.effective(rows, others), pool.effective_reference(rows, others), strict=True):
             torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-5)
+
+
+def test_swept_distances_against_torch():
+    motions, points = make_motions(30), torch.randn(120, 3)
+    torch.testing.assert_close(motions.swept(points, motions[3:9]), motions.swept_reference(points, motions[3:9]), atol=2e-6, rtol=1e-5)
+    assert motions.swept(points, motions).diagonal().abs().max() < 1e-6
+    assert Motions.empty().swept(points, motions).shape == (0, 30)
+
+
+def test_a_sets_evidence_against_torch(monkeypatch):
+    problem = make_problem()
+    pool = Pool(problem, problem.samples)
+    pool.add(make_motions(30, 0.1))
+    pool.pays, pool.loose = [torch.rand_like(p) for p in pool.pays], [torch.rand_like(p) > 0.5 for p in pool.pays]
+    sets = [[4], [3, 7, 20], list(range(12))]
+    got = [pool.total(s) for s in sets]
+    monkeypatch.setattr("p2gs.models.discovery.pool.native", None)
+    assert got == pytest.approx([pool.total(s) for s in sets], rel=1e-5) and min(got) > 0.1

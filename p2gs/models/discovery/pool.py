@@ -178,6 +178,13 @@ class Pool:
         rows = torch.tensor(list(chosen))
         share = []
         for s, e in enumerate(self.effective(rows, self.best(chosen))):
+            if native is not None:
+                e, w, out = e.contiguous(), self.problem.weights[s].contiguous(), torch.empty(2, len(rows))
+                native.evidence_shares(
+                    e.data_ptr(), w.data_ptr(), self.loose[s].data_ptr(), rows.data_ptr(), *e.shape, out.data_ptr()
+                )  # fmt: skip
+                share.append((out[0], out[1]))
+                continue
             value, who = e.max(0)
             value = value * self.problem.weights[s]
             loose = self.loose[s][rows].gather(0, who[None])[0]

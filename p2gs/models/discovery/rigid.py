@@ -52,7 +52,8 @@ class Motions:
 
     def packed(self) -> list[Tensor]:
         """turn, axis, centre, amount as the kernels take them, contiguous; the caller keeps them while their addresses are in use."""
-        return [self.turn.contiguous(), *(x.float().contiguous() for x in (self.axis, self.centre, self.amount))]
+        parts = [self.turn, self.axis, self.centre, self.amount]
+        return [x.contiguous() if x.dtype in (torch.float32, torch.bool) else x.float().contiguous() for x in parts]
 
     def matrices(self) -> tuple[Tensor, Tensor]:
         """R [B, 3, 3], t [B, 3]."""
@@ -151,5 +152,15 @@ class Motions:
 
     def swept(self, points: Tensor, other: "Motions") -> Tensor:
         """Root mean square distance between the images of points [P, 3] under every motion here and every other: [B, C]."""
+        if native is None or not len(points) or not points.dtype == self.amount.dtype == other.amount.dtype == torch.float32:
+            return self.swept_reference(points, other)
+        a, b, points, out = self.packed(), other.packed(), points.contiguous(), torch.empty(len(self), len(other))
+        native.motion_swept(
+            [m.data_ptr() for m in a], len(self), [m.data_ptr() for m in b], len(other), points.data_ptr(), len(points), out.data_ptr()
+        )
+        return out
+
+    def swept_reference(self, points: Tensor, other: "Motions") -> Tensor:
+        """``swept`` in torch, point by point."""
         a, b = self.apply(points), other.apply(points)
         return (a[:, None] - b[None]).pow(2).sum(-1).mean(-1).sqrt()
