@@ -27,6 +27,11 @@ void over_rows(int64_t nodes, int threads, const Step& step) {
         &context);
 }
 
+int padded_columns(const Graph& g) {
+    const int width = kernels().graph.width;
+    return (g.columns + width - 1) / width * width;
+}
+
 std::vector<float> padded(const Graph& g, const float* values) {
     std::vector<float> out(size_t(g.nodes) * g.stride);
     for (int64_t i = 0; i < g.nodes; ++i) std::copy_n(values + i * g.columns, g.columns, out.data() + i * g.stride);
@@ -40,7 +45,7 @@ void unpad(const Graph& g, const std::vector<float>& from, float* out) {
 }  // namespace
 
 void graph_average(Graph g, const float* values, float* out, int threads) {
-    g.stride = (g.columns + kGraphPad - 1) / kGraphPad * kGraphPad;
+    g.stride = padded_columns(g);
     const std::vector<float> in = padded(g, values);
     std::vector<float> mean(in.size());
     const auto kernel = kernels().graph.average;
@@ -49,7 +54,7 @@ void graph_average(Graph g, const float* values, float* out, int threads) {
 }
 
 void graph_labels(Graph g, const float* values, const LabelModel& model, float* out, int threads) {
-    g.stride = (g.columns + kGraphPad - 1) / kGraphPad * kGraphPad;
+    g.stride = padded_columns(g);
     const std::vector<float> cost = padded(g, values);
     std::vector<float> smooth = cost, now(cost.size()), next(cost.size());
     const GraphKernels& k = kernels().graph;

@@ -5,18 +5,18 @@
 
 namespace p2gs {
 
-constexpr int kGraphPad = 8;        // columns are padded to a multiple of this
-constexpr int kGraphColumns = 32;   // at most, of a labelling
+constexpr int kGraphColumns = 32;  // at most, of a labelling
 
 struct Graph {
     const int32_t* neighbours;  // [N][k]
     const float* weights;       // [N][k]
     int64_t nodes;
-    int k, columns, stride;  // stride: columns, padded
+    int k, columns, stride;  // stride: columns, padded to whole vectors
 };
 
 // Rows [begin, end) of [N][stride] tables; A: the graph's matrix.
 struct GraphKernels {
+    int width;  // floats of a vector
     // out = share * A in + (1 - share) * own; own may be null where share is 1
     void (*average)(const Graph&, const float* in, const float* own, float share, float* out, int64_t begin, int64_t end);
     // out = softmax(pull * A in - sharp * cost) over the columns; in may be null: nothing pulls
