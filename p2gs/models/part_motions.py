@@ -5,7 +5,7 @@ Not a training phase of the paper: its ancestors need hand-made part centres or 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -28,7 +28,8 @@ class PartMotionsConfig:
     """Options of part discovery.
 
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
-    candidates: how many complete explanations are compared by re-rendering.  coarse: photometric refinement right after discovery.
+    candidates: how many complete explanations are compared by re-rendering; of more, those that look best after ``look_steps`` of refinement at
+    the smallest size.  coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
     freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: the same for a further part.
     same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one
@@ -36,13 +37,16 @@ class PartMotionsConfig:
     [] = none).  islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
     surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.  reconsider: each part's motion, and
     one more, is searched again amid the others, refined; missing_penalty: relative image loss by which a part that comes so must win;
-    missing_confidence, missing_evidence: confidence and evidence that it must have (``reconsider``).  min_confidence: a part of less
+    missing_confidence, missing_evidence: confidence and evidence that it must have (``reconsider``).  split_reach: a part is tried as two
+    whose motions differ by up to twice this (internal units; 0 = never) where that saves ``split`` of its residual; also with a part left
+    out whose evidence is below ``doubtful``.  min_confidence: a part of less
     confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
 
     evidence_size: int = 200
     min_opacity: float = 0.5
     candidates: int = 3
+    look_steps: int = 40
     compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
     part_penalty: float = 0.02
@@ -55,6 +59,9 @@ class PartMotionsConfig:
     missing_penalty: float = 0.02
     missing_confidence: float = 0.3
     missing_evidence: float = 0.005
+    split_reach: float = 0.05
+    split: float = 0.12
+    doubtful: float = 0.1
     min_confidence: float = 0.02
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
@@ -94,7 +101,19 @@ def find_part_motions(
     stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in evidence]
     say("looking for parts")
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
-    explanations = _explanations(found)[: max(config.candidates, 1)]
+    explanations, looks = _explanations(found), []
+    if len(explanations) > config.candidates:
+        say(f"a quick look at {len(explanations)} explanations")
+        quick = replace(config.coarse, steps=config.look_steps, levels=config.coarse.levels[:1], level_starts=[0.0])
+
+        def first_look(explanation) -> float:
+            motions = refine(states, _label_states(explanation, states), views, quick, stacks, seed=seed, backend=backend, device=device)
+            cost = explanation_cost(states, motions, views, quick.levels[0], backend, device)
+            return cost * (1 + config.part_penalty) ** len(motions)
+
+        looks = [first_look(e) for e in explanations]
+        order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
+        explanations = [explanations[i] for i in order]
     best, costs, tried, level = None, [], [], config.coarse.levels[-1]
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, states)
@@ -127,6 +146,7 @@ def find_part_motions(
     motions.diagnostics = {
         "explanation": best[2],
         "photometric_costs": costs,
+        "first_looks": looks,
         "explanations": tried,
         "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],  # of the Gaussians above min_opacity
         "min_opacity": config.min_opacity,

@@ -95,7 +95,7 @@ def survey(
         for way in torch.linalg.svd(at - centre, full_matrices=False)[2][:2]:
             for size in [sign * r for r in reach for sign in (1, -1)]:
                 shift = torch.cat([torch.zeros(3, dtype=torch.float64), way * size])
-                step = allowed_step(motions.types[k], motions.transforms[k], centre, radius, shift)
+                step = allowed_step([motions.types[k]], motions.transforms[k : k + 1], centre[None], torch.tensor([radius]), shift[None])[0]
                 if float(step[3:].norm()) < 0.5 * abs(size):
                     continue
                 T = apply_step(motions.transforms[k], centre, radius, step)

@@ -101,47 +101,43 @@ class MovedGaussians:
 
 
 def tangent_gradient(means: Tensor, quats: Tensor, grad_means: Tensor, grad_quats: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradient of a loss by a small rotation about ``centre`` and a small translation of points already moved.
+    """Each point's share of the gradient of a loss by a small rotation about ``centre`` and a small translation of points already moved.
 
-    means, grad_means [n, 3]; quats, grad_quats [n, 4].  Returns (rotation [3], translation [3]), float64. A rotation by w turns a
-    quaternion q into q + 0.5 (0, w) q.
+    means, grad_means [n, 3]; quats, grad_quats [n, 4]; centre [3] or [n, 3].  Returns (rotation [n, 3], translation [n, 3]), float64: their
+    sums are the gradient. A rotation by w turns a quaternion q into q + 0.5 (0, w) q.
     """
     grad_means, grad_quats = grad_means.double(), grad_quats.double()
-    rotation = torch.linalg.cross(means.double() - centre, grad_means).sum(0)
+    rotation = torch.linalg.cross(means.double() - centre, grad_means)
     w, v = quats[:, :1].double(), quats[:, 1:].double()
     # (0, e_j) * q = (-v_j, w e_j + e_j x v), contracted with the gradient of q
     g0, gv = grad_quats[:, :1], grad_quats[:, 1:]
-    rotation = rotation + 0.5 * (-g0 * v + w * gv + torch.linalg.cross(v, gv)).sum(0)
-    return rotation, grad_means.sum(0)
+    return rotation + 0.5 * (-g0 * v + w * gv + torch.linalg.cross(v, gv)), grad_means
 
 
-def allowed_step(kind: str, T: Tensor, centre: Tensor, radius: float, step: Tensor) -> Tensor:
-    """Project a tangent step [6] = (rotation * radius, translation) at ``centre`` onto the motions of a joint type.
+def allowed_step(kinds: list[str], T: Tensor, centre: Tensor, radius: Tensor, step: Tensor) -> Tensor:
+    """Project tangent steps [K, 6] = (rotation * radius, translation) at ``centre`` [K, 3] onto the motions of the joints' types.
 
-    Prismatic: no rotation. Revolute: the pitch (translation along the axis) must stay zero, one linear condition; a Newton correction
-    removes what pitch there is. Free: as it is.
+    T [K, 4, 4], radius [K].  Prismatic: no rotation. Revolute: the pitch (translation along the axis) must stay zero, one linear condition;
+    a Newton correction removes what pitch there is. Free: as it is.
     """
-    if kind == "prismatic":
-        return torch.cat([torch.zeros(3, dtype=step.dtype), step[3:]])
-    if kind == "free":
-        return step
-
-    rotvec = so3.matrix_to_rotvec(T[:3, :3])
-    angle = rotvec.norm().clamp_min(1e-3)
-    axis, t = rotvec / angle, T[:3, 3]
-    across = t - axis * (axis @ t)
+    rotvec = so3.matrix_to_rotvec(T[:, :3, :3])
+    angle = rotvec.norm(dim=1, keepdim=True).clamp_min(1e-3)
+    axis, t = rotvec / angle, T[:, :3, 3]
+    pitch = (axis * t).sum(1, keepdim=True)
+    across = t - axis * pitch
     # the axis turns by the inverse left Jacobian of the rotation vector (Sola et al. 2018, arXiv:1812.01537, Eq. 146)
     tilt = across / (2 * torch.tan(angle / 2)) + torch.linalg.cross(axis, across) / 2
-    normal = torch.cat([(torch.linalg.cross(t - centre, axis) + tilt) / radius, axis])
-    return step - normal * ((normal @ step + axis @ t) / (normal @ normal).clamp_min(1e-12))
+    normal = torch.cat([(torch.linalg.cross(t - centre, axis) + tilt) / radius[:, None], axis], 1)
+    turned = step - normal * (((normal * step).sum(1, keepdim=True) + pitch) / (normal * normal).sum(1, keepdim=True).clamp_min(1e-12))
+    slid = torch.cat([torch.zeros_like(step[:, :3]), step[:, 3:]], 1)
+    by_type = {"revolute": turned, "prismatic": slid, "free": step}
+    return torch.stack([by_type[kind][k] for k, kind in enumerate(kinds)]) if kinds else step
 
 
-def apply_step(T: Tensor, centre: Tensor, radius: float, step: Tensor) -> Tensor:
-    """exp of the tangent step about ``centre``, after T."""
-    delta = torch.eye(4, dtype=T.dtype)
-    delta[:3, :3] = so3.rotvec_to_matrix(step[:3] / radius)
-    delta[:3, 3] = centre - delta[:3, :3] @ centre + step[3:]
-    return delta @ T
+def apply_step(T: Tensor, centre: Tensor, radius: Tensor | float, step: Tensor) -> Tensor:
+    """exp of the tangent step [..., 6] about ``centre`` [..., 3], after T [..., 4, 4]; radius [..., 1] or a number."""
+    R = so3.rotvec_to_matrix(step[..., :3] / radius)
+    return se3.make(R, centre - (R @ centre[..., None])[..., 0] + step[..., 3:]) @ T
 
 
 @dataclass
@@ -186,15 +182,18 @@ def polish(
         labels = torch.where(solid, side.labels, -1)
         bodies.append(MovedGaussians(side.gaussians, labels, device))
         fronts.append(None if side.seen_from is None else side.seen_from[labels >= 0].to(device))
-    rows = [[body.rows(k + 1) for k in range(len(transforms))] for body in bodies]
-    anchors, radius = _anchors(sides, bodies, rows, transforms)
+    rows = [(body.labels > 0).nonzero().squeeze(1) for body in bodies]
+    parts = [body.labels[r] - 1 for body, r in zip(bodies, rows, strict=True)]
+    enough = [torch.bincount(p, minlength=len(types)).cpu() >= 10 for p in parts]
+    slides = torch.tensor([kind == "prismatic" for kind in types])
+    anchors, radius = _anchors(sides, bodies, transforms)
     first, second = torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
-    taken = [0] * len(transforms)
+    taken = torch.zeros(len(transforms), 1)
     losses: list[list[float]] = [[] for _ in sides]
     total = config.steps * len(sides)
     for step in range(total):
         turn, number = step % len(sides), step // len(sides)
-        side, body, fraction = sides[turn], bodies[turn], step / total
+        side, body, fraction, r, part = sides[turn], bodies[turn], step / total, rows[turn], parts[turn]
         generator = torch.Generator().manual_seed((seed + side.back) * 1_000_003 + number)
         background = torch.rand(3, generator=generator)
         index = view_index(seed + side.back + 13, number, len(side.views))
@@ -205,31 +204,29 @@ def polish(
         out = body.render(means, quats, sh, shot.camera, background, backend)
         loss = l1_ssim(out.colour, shot.image.to(out.colour.device), config.ssim_lambda)
         loss.backward()
-        rate = config.rate * exponential(1.0, 0.01, fraction)
         if fraction >= 0.9:
             losses[turn].append(float(loss.detach()))
-        for k, r in enumerate(rows[turn]):
-            if r.numel() < 10:
-                continue
-            here = anchors[k] if side.back else se3.apply(transforms[k], anchors[k][None])[0]
-            at = [means.detach()[r], quats.detach()[r], means.grad[r], quats.grad[r]]
-            if fronts[turn] is not None and config.front > -1:
-                T = transforms[k].T if side.back else transforms[k]  # of T^-1 only the rotation is asked for
-                front = facing(fronts[turn][r], T[:3, :3], at[0], shot.camera) >= config.front
-                at = [value[front] for value in at]
-            rotation, translation = (v.cpu() for v in tangent_gradient(*at, here.to(means.device)))
-            if side.back:
-                rotation, translation = (-transforms[k, :3, :3] @ v for v in (rotation, translation))
-            gradient = torch.cat([rotation / radius[k], translation])
-            taken[k] += 1
-            first[k] = 0.9 * first[k] + 0.1 * gradient
-            second[k] = 0.99 * second[k] + 0.01 * gradient * gradient
-            direction = first[k] / (1 - 0.9 ** taken[k]) / ((second[k] / (1 - 0.99 ** taken[k])).sqrt() + 1e-12)
-            centre = se3.apply(transforms[k], anchors[k][None])[0]
-            delta = allowed_step(types[k], transforms[k], centre, radius[k], -rate * direction)
-            transforms[k] = apply_step(transforms[k], centre, radius[k], delta)
-            if types[k] == "prismatic":
-                transforms[k, :3, :3] = torch.eye(3, dtype=torch.float64)
+        centre = se3.apply(transforms, anchors[:, None])[:, 0]
+        at = [means.detach()[r], quats.detach()[r], means.grad[r], quats.grad[r]]
+        pulls = torch.cat(tangent_gradient(*at, (anchors if side.back else centre).to(means.device)[part]), 1)
+        if fronts[turn] is not None and config.front > -1:
+            back = transforms[:, :3, :3].transpose(1, 2) if side.back else transforms[:, :3, :3]
+            front = facing(fronts[turn][r], back.to(means)[part], at[0], shot.camera) >= config.front
+            pulls = pulls * front[:, None]
+        gradient = pulls.new_zeros(len(types), 6).index_add_(0, part, pulls).cpu()
+        if side.back:
+            gradient = -torch.cat([(transforms[:, :3, :3] @ g[..., None])[..., 0] for g in gradient.split(3, 1)], 1)
+        gradient[:, :3] /= radius[:, None]
+        on = enough[turn][:, None]
+        taken = taken + on
+        first = torch.where(on, 0.9 * first + 0.1 * gradient, first)
+        second = torch.where(on, 0.99 * second + 0.01 * gradient * gradient, second)
+        seen = taken.clamp_min(1)
+        direction = first / (1 - 0.9**seen) / ((second / (1 - 0.99**seen)).sqrt() + 1e-12)
+        rate = config.rate * exponential(1.0, 0.01, fraction)
+        delta = allowed_step(types, transforms, centre, radius, -rate * direction)
+        transforms = torch.where(on[..., None], apply_step(transforms, centre, radius[:, None], delta), transforms)
+        transforms[slides, :3, :3] = torch.eye(3, dtype=torch.float64)
     for k, kind in enumerate(types):
         if kind == "revolute":
             transforms[k] = se3.project_revolute(transforms[k])  # what pitch the last steps left
@@ -237,29 +234,30 @@ def polish(
 
 
 def facing(seen_from: Tensor, rotation: Tensor, means: Tensor, camera: Camera) -> Tensor:
-    """Cosine [n] between the direction from moved points ``means`` [n, 3] to the camera and their turned ``seen_from`` [n, 3].
+    """Cosine [n] between the direction from moved points ``means`` [n, 3] to the camera and their ``seen_from`` [n, 3], turned by
+    ``rotation`` [3, 3] or [n, 3, 3].
 
     The back of a door's front face, seen through an opened door, stands a door's thickness before the inner face in the photograph.
     """
     way = torch.nn.functional.normalize(camera.position.to(means) - means, dim=1)
-    return ((seen_from @ rotation.T.to(means)) * way).sum(1)
+    return ((rotation.to(means) @ seen_from[..., None])[..., 0] * way).sum(1)
 
 
-def _anchors(sides, bodies, rows, transforms: Tensor) -> tuple[list[Tensor], list[float]]:
-    """Each part's centre at the start [3] (float64, CPU) and the spread of its points, means over the sides."""
+def _anchors(sides, bodies, transforms: Tensor) -> tuple[Tensor, Tensor]:
+    """Each part's centre at the start [K-1, 3] and the spread of its points [K-1] (float64, CPU), means over the sides."""
     anchors, radius = [], []
     for k in range(len(transforms)):
         centres, spreads = [], []
-        for side, body, r in zip(sides, bodies, (of[k] for of in rows), strict=True):
-            if r.numel() == 0:
+        for side, body in zip(sides, bodies, strict=True):
+            points = body.g.means[body.rows(k + 1)].double().cpu()
+            if not len(points):
                 continue
-            points = body.g.means[r].double().cpu()
             centre = points.mean(0)
             spreads.append(float((points - centre).square().sum(1).mean().sqrt()))
             centres.append(se3.apply(se3.inverse(transforms[k]), centre[None])[0] if side.back else centre)
         anchors.append(torch.stack(centres).mean(0) if centres else torch.zeros(3, dtype=torch.float64))
         radius.append(max(sum(spreads) / max(len(spreads), 1), 1e-3))
-    return anchors, radius
+    return torch.stack(anchors), torch.tensor(radius, dtype=torch.float64)
 
 
 @torch.no_grad()

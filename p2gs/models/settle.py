@@ -14,6 +14,7 @@ from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.islands import settle_islands
 from p2gs.models.joint_confidence import measure_joints, measuring_level
 from p2gs.models.part_choices import settle_types, without_part
+from p2gs.models.part_split import splits
 from p2gs.models.refine_motions import explanation_cost, refine
 from p2gs.ops.sh import dc_to_rgb
 
@@ -47,10 +48,11 @@ def reconsider(
     """Exchange motions for others that explain what the refined rest leaves over, or add one, while the photographs agree.
 
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``); with each every surfel chooses its
-    part anew and the states are re-rendered. The best exchange and the best addition are refined; the image loss must fall by
-    ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part. Junk lowers the loss by as much as a small door does:
-    with labels chosen anew, a further part's surface must also be found in both states (discovery's confidence at least
-    ``missing_confidence``) and the photographs must hold its joint where it is (``JointEvidence.confidence`` at least
+    part anew and the states are re-rendered. A part may also be two of nearly one motion (``splits``), as it is or with a doubtful part
+    left out: what moved by another amount than its neighbour is easily explained by a wild motion. The best of each kind is refined; the
+    image loss must fall by ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part. Junk lowers the loss by as
+    much as a small door does: with labels chosen anew, a further part's surface must also be found in both states (discovery's confidence
+    at least ``missing_confidence``) and the photographs must hold its joint where it is (``JointEvidence.confidence`` at least
     ``missing_evidence``).  Returns the motions and what was tried.
     """
     options = {"backend": backend, "device": device}
@@ -61,25 +63,31 @@ def reconsider(
 
     cost = cost_of(motions)
     for _ in range(limit if len(motions) else 0):
-        exchanged = [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]
-        added = [(len(motions), m) for m in _with_part(found, states, motions, None)] if len(motions) < limit else []
+        tries = {"exchanged": [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]}
+        tries["exchanged for a split"] = _split_without(found, states, motions, views, config, stacks, options)
+        if len(motions) < limit:
+            tries["added"] = [(len(motions), m) for m in _with_part(found, states, motions, None)]
+            tries["split"] = splits(states, motions, views, config.split_reach, config.split, level=level, **options)
         best = None
-        for tries, penalty in ((exchanged, config.freedom_penalty), (added, config.missing_penalty)):
-            if not tries:
+        for change, proposed in tries.items():
+            if not proposed:
                 continue
-            costs = [cost_of(m) for _, m in tries]
-            part, tried = tries[costs.index(min(costs))]
+            costs = [cost_of(m) for _, m in proposed]
+            part, tried = proposed[costs.index(min(costs))]
             refined = refine(states, tried, views, config.coarse, stacks, seed=seed, **options)
-            reached = cost_of(refined)
-            change = "added" if part == len(motions) else "exchanged"
+            reached, further = cost_of(refined), len(refined) > len(motions)
+            if "split" in change:  # where the halves meet, geometry may know better once their motions are known
+                anew = refine(states, _relabelled(found, states, refined), views, config.coarse, stacks, seed=seed, **options)
+                reached, refined = min((reached, refined), (cost_of(anew), anew), key=lambda t: t[0])
             entry = {"change": change, "part": part, "type": tried.types[part], "before": cost, "tried": min(costs), "after": reached}
             log.append(entry)
-            rank = reached / (1 - penalty)
-            if change == "added" and rank < cost:
+            rank = reached / (1 - (config.missing_penalty if further else config.freedom_penalty))
+            if further and rank < cost:
                 own = _relabelled(found, states, refined)
                 size = min(measuring_level(views[s]) for s in (0, 1))
                 evidence = measure_joints(states, own.labels, own.transforms, own.types, views, stacks, level=size, **options)
-                entry |= {"confidence": float(own.confidence[part]), "evidence": evidence[part].confidence}
+                new = {part, len(motions)}
+                entry |= {"confidence": min(float(own.confidence[k]) for k in new), "evidence": min(evidence[k].confidence for k in new)}
                 if entry["confidence"] < config.missing_confidence or entry["evidence"] < config.missing_evidence:
                     continue
             if rank < cost and (best is None or rank < best[0]):
@@ -95,6 +103,20 @@ def _with_part(found: Discovery, states, motions: PartMotions, part: int | None)
     k, out = len(motions) if part is None else part, []
     for transform, kind in instead_of(found, motions.transforms, motions.types, part):
         out.append(_relabelled(found, states, motions.with_motion(k, kind, transform)))
+    return out
+
+
+def _split_without(found: Discovery, states, motions: PartMotions, views, config: PartMotionsConfig, stacks, options: dict):
+    """Without each part that the photographs do not hold where it is, labels chosen anew: which other part is two, and the motions so."""
+    level, out = config.coarse.levels[-1], []
+    if config.split_reach <= 0:
+        return out
+    size = min(measuring_level(views[s]) for s in (0, 1))
+    evidence = measure_joints(states, motions.labels, motions.transforms, motions.types, views, stacks, level=size, **options)
+    for k in range(len(motions)):
+        if evidence[k].confidence < config.doubtful:
+            rest = _relabelled(found, states, without_part(motions, k, 0))
+            out += splits(states, rest, views, config.split_reach, config.split, level=level, **options)
     return out
 
 

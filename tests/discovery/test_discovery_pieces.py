@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from p2gs.models.discovery.pipeline import discover, ranked, relabel
 from p2gs.models.discovery.problem import build_problem, evidence_masks
 from p2gs.models.discovery.refine import pattern_search
 from p2gs.models.discovery.rigid import Motions
+from p2gs.models.discovery.search import Search
 from p2gs.models.discovery.surfels import Surfels, window_planes
 
 
@@ -87,11 +89,19 @@ def test_seen_through_is_moved_and_covered_is_unknown():
     assert float(problem.moved[0][front].float().mean()) > 0.7
 
 
-def test_ranking_is_by_score_but_what_only_images_tell_comes_second():
-    make = lambda score, n, only=False: Explanation(random_motions(n), Labelling([], []), 0.0, score, only)  # noqa: E731
-    order = ranked([make(0.3, 2), make(0.1, 3), make(0.5, 4, True), make(0.2, 2)])
-    assert [(e.score, e.only_images) for e in order] == [(0.1, False), (0.5, True), (0.2, False), (0.3, False)]
-    assert ranked([make(0.3, 2), make(0.1, 2, True)])[0].score == 0.1
+def test_ranking_is_by_score_without_the_same_motions_again():
+    torch.manual_seed(0)
+    a, b = random_motions(2), random_motions(3)
+    search = SimpleNamespace(
+        problem=SimpleNamespace(config=DiscoveryConfig(part_cost=0.0, search_weight=1.0)),
+        pool=SimpleNamespace(add=lambda m: torch.arange(len(m)), total=lambda chosen: 0.1 * (len(chosen) == 3)),
+        probe=torch.randn(50, 3), radius=0.05,
+    )  # fmt: skip
+    search.agree = lambda x, y: Search.agree(search, x, y)
+    make = lambda score, m: Explanation(m, Labelling([], []), 0.0, score)  # noqa: E731
+    order = ranked(search, [make(0.3, a), make(0.35, b), make(0.2, a[torch.tensor([1, 0])]), make(0.5, a[:1])])
+    assert [(e.score, len(e.motions)) for e in order] == [(0.2, 2), (0.25, 3), (0.5, 1)]
+    assert [e.value for e in order] == [0.0, 0.1, 0.0]
 
 
 def test_classify_needs_enough_views_and_a_majority():

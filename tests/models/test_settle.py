@@ -28,7 +28,7 @@ def scene(monkeypatch):
     def reconsider(kind, T, proposed, more=(), limit=1):
         monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: more if part is None else proposed)
         motions = PartMotions([kind], T[None], torch.ones(1), [labels, labels], margins)
-        config = PartMotionsConfig(coarse=COARSE)
+        config = PartMotionsConfig(coarse=COARSE, split_reach=0.0)
         return motions, *settle.reconsider(None, states, motions, views, config, [None, None], limit, seed=0, backend="auto")
 
     return reconsider
@@ -70,7 +70,7 @@ def test_a_further_part_must_be_found_in_both_states_and_held(monkeypatch, confi
     monkeypatch.setattr(settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins))
     monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: [(slide(), "prismatic")] if part is None else [])
     wrong = PartMotions(["revolute"], hinge()[None], torch.ones(1), [labels, labels], margins)
-    config = PartMotionsConfig(coarse=COARSE)
+    config = PartMotionsConfig(coarse=COARSE, split_reach=0.0)
     found, log = settle.reconsider(None, states, wrong, views, config, [None, None], 2, seed=0, backend="auto")
     assert log[0]["after"] < 0.9 * log[0]["before"] and log[0]["confidence"] == pytest.approx(confidence)
     assert found.types == (["revolute", "prismatic"] if taken else ["revolute"]) and log[0]["evidence"] == evidence
@@ -86,7 +86,7 @@ def test_a_part_of_which_one_state_shows_nothing_is_dropped(monkeypatch):
 
     monkeypatch.setattr(settle, "relabel", relabel)
     monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
-    config = PartMotionsConfig(coarse=COARSE)
+    config = PartMotionsConfig(coarse=COARSE, split_reach=0.0)
     options = {"seed": 0, "backend": "auto"}
     two = PartMotions(["revolute", "prismatic"], torch.stack([hinge(), slide()]), torch.tensor([0.01, 0.4]), [labels * 2] * 2, margins)
     kept, gone = settle.drop_unfounded(None, states, two, views, config, [None, None], **options)

@@ -50,9 +50,9 @@ def look_at(eye: torch.Tensor, size: int) -> Camera:
 def photographs(
     g: GaussianTensors, labels: torch.Tensor, transform: torch.Tensor, state: int, size: int = 64, count: int = 8
 ) -> list[View]:
-    """Views on a ring of the panels with part 1 moved by ``transform``."""
+    """Views on a ring of the panels with part 1 moved by ``transform`` [4, 4], or every part by its own, [K, 4, 4]."""
     body = MovedGaussians(g, labels)
-    means, quats, sh = body.moved(transform[None])
+    means, quats, sh = body.moved(transform.reshape(-1, 4, 4))
     views = []
     for k in range(count):
         angle = torch.tensor(k * 2 * torch.pi / count)

@@ -16,16 +16,12 @@ from p2gs.models.discovery.rigid import Motions
 
 @dataclass
 class Explanation:
-    """A complete explanation: motions, labelling, value of the set and image-space score (lower is better).
-
-    only_images: differs from the best by less than the geometry can tell.
-    """
+    """A complete explanation: motions, labelling, value of the set and image-space score (lower is better)."""
 
     motions: Motions
     labelling: Labelling
     value: float
     score: float = 0.0
-    only_images: bool = False
 
 
 def part_samples(problem: Problem, labelling: Labelling, k: int, n: int, moved_only: bool = True) -> list[Tensor]:

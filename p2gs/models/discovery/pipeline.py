@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import Callable, Optional
 
 import numpy as np
@@ -70,16 +71,13 @@ def discover(
         for value, chosen in solutions[: config.candidates]:
             if value > 0 and chosen:
                 explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, search.limit, limit, still))
-        if explanations and len(explanations[0].motions) < limit:
-            explanations += divided(problem, graphs, min(explanations, key=lambda e: e.score), still)
-        for e in explanations:  # what the search says of the motions as they are now
-            e.value = search.pool.total(search.pool.add(e.motions).tolist())
-            e.score += 0.2 * config.part_cost * len(e.motions) - config.search_weight * e.value
+        explanations += again(problem, graphs, search, explanations, limit, still)
+        explanations = ranked(search, explanations)
         lap("labels", 0.95)
     if not explanations:
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]
         explanations = [Explanation(Motions.empty(), Labelling(nothing, nothing), 0.0)]
-    candidates = [describe(problem, e, start, end) for e in ranked(explanations)]
+    candidates = [describe(problem, e, start, end) for e in explanations]
     best = candidates[0]
     out = Discovery(
         motions=best.motions, surfels=best.surfels, probability=best.probability, score=best.score, value=best.value,
@@ -161,25 +159,36 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
     return prune(problem, graphs, motions, labelling, value, limit, axes)
 
 
-def ranked(explanations: list[Explanation]) -> list[Explanation]:
-    """Best first; one that only images can tell from the best goes second."""
-    first, *rest = sorted(explanations, key=lambda e: e.score)
-    return [first, *sorted(rest, key=lambda e: not e.only_images)]
+def again(problem: Problem, graphs: list[Graph], search: Search, found: list[Explanation], limit: int, axes: Tensor) -> list[Explanation]:
+    """What the search makes of the best explanations once their motions are fitted: sets that are new to it, finished.
+
+    A wrong motion is often there because a rough one left over what it explains.
+    """
+    known = [search.pool.add(e.motions).tolist() for e in found]
+    out = []
+    for start in sorted(range(len(found)), key=lambda i: found[i].score)[:2]:
+        chosen = search.improve(search.refit(known[start]))
+        if chosen and not any(search.same(chosen, other) for other in known):
+            known.append(chosen)
+            motions = search.pool.motions[torch.tensor(chosen)]
+            out.append(finish(problem, graphs, motions, search.value(chosen), search.limit, limit, axes))
+    return out
 
 
-def divided(problem: Problem, graphs: list[Graph], e: Explanation, axes: Tensor) -> list[Explanation]:
-    """The explanation with its slide that best bears it parted into two of nearly the same travel: geometry may not tell, images may."""
-    tried = [
-        (split_amounts(problem, e.labelling, graphs, e.motions, k, apart=0.7), k) for k in range(len(e.motions)) if not e.motions.turn[k]
-    ]
-    tried = [(t, k) for t, k in tried if t[0] > 0]
-    if not tried:
-        return []
-    (_, a, b), k = max(tried)
-    motions, labelling = settle_parts(problem, graphs, with_amounts(e.motions, k, a, b), axes)
-    if min(masses(problem, labelling)) < problem.config.min_mass:
-        return []
-    return [Explanation(motions, labelling, e.value, total_score(problem, motions, labelling), only_images=True)]
+def judged(search: Search, e: Explanation) -> Explanation:
+    """The explanation with what the search says of its motions as they are now: value, and score with it."""
+    cfg = search.problem.config
+    value = search.pool.total(search.pool.add(e.motions).tolist())
+    return replace(e, value=value, score=e.score + 0.2 * cfg.part_cost * len(e.motions) - cfg.search_weight * value)
+
+
+def ranked(search: Search, found: list[Explanation]) -> list[Explanation]:
+    """Judged, best first, without those whose motions all agree with a better one's."""
+    out: list[Explanation] = []
+    for e in sorted((judged(search, e) for e in found), key=lambda e: e.score):
+        if not any(search.agree(e.motions, better.motions) for better in out):
+            out.append(e)
+    return out
 
 
 def prune(
@@ -191,8 +200,7 @@ def prune(
         tried = []
         for k in range(len(motions)):
             fewer = motions[torch.tensor([i for i in range(len(motions)) if i != k])]
-            relabelled = label(problem, fewer, graphs)
-            tried.append((total_score(problem, fewer, relabelled), k, fewer))
+            tried.append((total_score(problem, fewer, label(problem, fewer, graphs)), k, fewer))
         least, _, fewer = min(tried, key=lambda t: t[:2])
         if least > score and len(motions) <= limit:
             break

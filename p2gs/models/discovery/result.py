@@ -74,9 +74,8 @@ class Discovery(Candidate):
     """The best explanation, the runners-up and what led there.
 
     margin_start, margin_end [N]: confidence of the labels of the input points.  evidence_start, evidence_end [N] int: 1 moved,
-    0 static, -1 unknown.  candidates: complete explanations, best first, this one included; one that
-    differs from the best by less than geometry can tell comes second.  diagnostics: each stage's own measure.  problem, graphs,
-    search: what was searched and how, for ``relabel`` and ``instead_of``.
+    0 static, -1 unknown.  candidates: complete explanations, best first, this one included.  diagnostics: each
+    stage's own measure.  problem, graphs, search: what was searched and how, for ``relabel`` and ``instead_of``.
     """
 
     margin_start: Tensor = field(default_factory=lambda: torch.zeros(0))

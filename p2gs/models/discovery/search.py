@@ -193,12 +193,16 @@ class Search:
         return out
 
     def same(self, a: list[int], b: list[int]) -> bool:
+        m = self.pool.motions
+        return self.agree(m[torch.tensor(a, dtype=torch.long)], m[torch.tensor(b, dtype=torch.long)])
+
+    def agree(self, a: Motions, b: Motions) -> bool:
+        """Do two sets of motions agree one by one, in some order?"""
         if len(a) != len(b):
             return False
-        if not a:
+        if not len(a):
             return True
-        m = self.pool.motions
-        d = m[torch.tensor(a)].swept(self.probe, m[torch.tensor(b)])
+        d = a.swept(self.probe, b)
         if len(a) > 7:
             return bool((d.min(1).values < self.radius).all())
         return any(all(float(d[i, j]) < self.radius for i, j in enumerate(p)) for p in itertools.permutations(range(len(b))))
