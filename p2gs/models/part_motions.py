@@ -28,8 +28,8 @@ class PartMotionsConfig:
     """Options of part discovery.
 
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
-    candidates: how many complete explanations are compared by re-rendering; of more, those that look best after ``look_steps`` of refinement at
-    the smallest size.  coarse: photometric refinement right after discovery.
+    candidates: how many complete explanations are compared by re-rendering; of more, those that look best after ``look_steps`` of
+    refinement at the smallest size.  coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
     freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: the same for a further part.
     same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one

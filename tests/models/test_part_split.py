@@ -53,11 +53,11 @@ def test_one_part_stays_one():
 def test_residuals_are_those_of_the_pixels_a_gaussian_shows_in():
     states, one, views, labels = two_halves("prismatic", 0.06)
     apart, shows = residuals_by_gaussian(states[0].gaussians, one.labels[0], one.transforms, views[1], count=8, **OPTIONS)
-    right, _ = residuals_by_gaussian(states[0].gaussians, one.labels[0], one.transforms[:0], views[0], count=8, **OPTIONS)
+    right, _ = residuals_by_gaussian(states[0].gaussians, 0 * labels, one.transforms, views[0], count=8, **OPTIONS)
     left_out = torch.where(labels == 2, -1, one.labels[0])
     _, fewer = residuals_by_gaussian(states[0].gaussians, left_out, one.transforms, views[1], count=8, **OPTIONS)
     seen = shows > 1
-    assert float(right[seen].mean()) < 0.05 < float(apart[seen & (labels > 0)].mean())
+    assert 2 * float(right[seen].mean()) < float(apart[seen & (labels > 0)].mean())
     assert float(fewer[labels == 2].abs().sum()) == 0 < float(fewer[labels == 1].sum())
 
 
