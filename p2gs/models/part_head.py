@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from p2gs.ops.assign import soft_assignment
+
 
 class PartHead(nn.Module):
     """f: [N, dim] -> [N, K] logits. psi itself is a per-Gaussian parameter of ``Splats`` (it follows densification)."""
@@ -18,8 +20,7 @@ class PartHead(nn.Module):
 
     def forward(self, psi: Tensor, temperature: float = 1.0) -> Tensor:
         """psi [N, dim] -> probabilities [N, K]."""
-        # parts first: a softmax over a short last dimension is several times slower
-        return torch.softmax((self.weight @ psi.T + self.bias[:, None]) / temperature, dim=0).T
+        return soft_assignment(psi, self.weight, self.bias, temperature)
 
     def embed(self, labels: Tensor, sureness: Tensor) -> Tensor:
         """Embeddings [N, dim] whose logits favour ``labels`` [N] by ``sureness`` [N]."""

@@ -8,6 +8,7 @@
 #include <cstdint>
 
 #include "adam.h"
+#include "assign.h"
 #include "blend.h"
 #include "evidence.h"
 #include "graph.h"
@@ -32,6 +33,7 @@ struct Kernels {
     GraphKernels graph;
     ViewKernels views;
     EvidenceKernels evidence;
+    AssignKernels assign;
 };
 
 namespace avx512 { extern const Kernels table; }

@@ -81,4 +81,5 @@ NB_MODULE(_native, m) {
     bind_evidence(m);
     bind_motions(m);
     bind_views(m);
+    bind_assign(m);
 }
