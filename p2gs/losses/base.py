@@ -53,7 +53,8 @@ class PartState:
     knn [N, k] int64: neighbours in canonical space, self excluded.  target_rotation [K, 3, 3]: detached Kabsch fit of the pairs.
     repel_points [R, 3] in state-0 coordinates, or None.  extent: diagonal of the object's box.  spacing: median nearest-neighbour
     distance of the Gaussians.  hardness in [0, 1]: how far the soft-to-hard schedule has come.
-    twists [K-1, 6]: logarithms of the movable parts' transforms where the phase has them at hand.
+    twists [K-1, 6]: logarithms of the movable parts' transforms where the phase has them at hand.  shared: what losses of this step
+    have computed and others use too, by a key of their own (a graph in common: one backward pass for all of them); ``replace`` drops it.
     """
 
     probs: Tensor
@@ -70,6 +71,7 @@ class PartState:
     repel_points: Optional[Tensor] = None
     hardness: float = 0.0
     twists: Optional[Tensor] = None
+    shared: dict = field(default_factory=dict, init=False)
 
     def at(self, time: float) -> Tensor:
         """Motions [K, 4, 4] from canonical time to ``time`` (0 start, 1 end)."""

@@ -27,9 +27,23 @@ def select_pairs(inputs: LossInputs, sample: int) -> Pairs | None:
     parts = inputs.parts
     if parts is None or parts.pairs is None or parts.mu0 is None or parts.mu1 is None or len(parts.pairs) == 0:
         return None
-    rows = sample_rows(len(parts.pairs), sample, inputs.step, parts.pairs.device)
-    index = parts.pairs[rows]
-    return Pairs(index, parts.probs.T.index_select(1, index).T, parts.mu0[rows], parts.mu1[rows])
+    key = ("pairs", sample, inputs.step)
+    known = parts.shared.get(key)
+    if known is None:
+        rows = sample_rows(len(parts.pairs), sample, inputs.step, parts.pairs.device)
+        index, mu0, mu1 = parts.pairs, parts.mu0, parts.mu1
+        if not isinstance(rows, slice):
+            index, mu0, mu1 = (t.index_select(0, rows) for t in (index, mu0, mu1))
+        known = parts.shared[key] = Pairs(index, parts.probs.T.index_select(1, index).T, mu0, mu1)
+    return known
+
+
+def unexplained(inputs: LossInputs, sample: int) -> Tensor:
+    """What every part's motion leaves of the pairs of ``select_pairs``: R_k mu0 + t_k - mu1, [K, 3, M]."""
+    pairs, shared, key = select_pairs(inputs, sample), inputs.parts.shared, ("unexplained", sample, inputs.step)
+    if key not in shared:
+        shared[key] = carried(inputs.parts.transforms, pairs.mu0) - pairs.mu1.T
+    return shared[key]
 
 
 def carried(transforms: Tensor, points: Tensor) -> Tensor:
@@ -69,7 +83,7 @@ class Vector(Loss):
         pairs = select_pairs(inputs, self.sample)
         if pairs is None:
             return None
-        cost = squared(carried(inputs.parts.transforms, pairs.mu0) - pairs.mu1.T, self.robust, inputs.parts.extent, dim=1)
+        cost = squared(unexplained(inputs, self.sample), self.robust, inputs.parts.extent, dim=1)
         per_pair = (pairs.probs.T * cost).sum(0)
         return reduce_pairs(per_pair, self.reduce, len(inputs.parts.pairs))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal
 
 import torch
@@ -16,7 +17,13 @@ def sample_rows(total: int, sample: int, step: int, device=None) -> Tensor | sli
     """``sample`` distinct row numbers out of ``total``, a function of the step alone; all rows where sample is 0 or not smaller."""
     if sample <= 0 or sample >= total:
         return slice(None)
-    return torch.randperm(total, generator=torch.Generator().manual_seed(step))[:sample].to(device)
+    return _permutation(total, step)[:sample].to(device)
+
+
+@lru_cache(maxsize=4)
+def _permutation(total: int, step: int) -> Tensor:
+    """Losses of one step share it; nobody writes into it."""
+    return torch.randperm(total, generator=torch.Generator().manual_seed(step))
 
 
 @register_loss("part")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs, register_loss
-from p2gs.losses.motion import carried, select_pairs
+from p2gs.losses.motion import select_pairs, unexplained
 from p2gs.losses.parts import sample_rows
 from p2gs.ops.blend import likeliest
 from p2gs.ops.knn import knn
@@ -37,7 +37,7 @@ class Velocity(Loss):
         weights = pairs.probs.T
         weights = weights / weights.sum(1, keepdim=True).clamp_min(1.0)
         if self.variant == "rigid":
-            displacement = carried(inputs.parts.transforms, pairs.mu0) - pairs.mu1.T
+            displacement = unexplained(inputs, self.sample)
         else:
             displacement = (pairs.mu1 - pairs.mu0).T.expand(len(weights), -1, -1)
         mean = (weights[:, None] * displacement).sum(2, keepdim=True) / weights.sum(1)[:, None, None].clamp_min(1e-12)

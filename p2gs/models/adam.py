@@ -40,6 +40,14 @@ class NamedAdam(torch.optim.Adam):
                 return group
         raise KeyError(name)
 
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """As torch's, without its bookkeeping, which takes longer than dropping a dozen gradients."""
+        if not set_to_none:
+            return super().zero_grad(set_to_none=False)
+        for group in self.param_groups:
+            for param in group["params"]:
+                param.grad = None
+
     @torch.no_grad()
     def step(self, closure=None):
         """One update of every parameter that has a gradient; returns what ``closure`` returns."""

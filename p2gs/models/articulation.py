@@ -12,12 +12,13 @@ from p2gs.losses.base import Loss, LossInputs, PartState
 from p2gs.models.canonical import carry
 from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
 from p2gs.models.motion import PartScrews, blend_move, initial_screws
+from p2gs.models.observed_pairs import ObservedPairs
 from p2gs.models.part_head import PartHead, random_embeddings
 from p2gs.models.phase import exponential, register_phase
 from p2gs.models.repel import place_repel_points
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
 from p2gs.models.splats import Splats
-from p2gs.ops import se3, so3
+from p2gs.ops import se3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors
 
@@ -106,6 +107,7 @@ class ArticulationPhase(ImagePhase):
             psi = random_embeddings(len(canonical.gaussians), config.embedding_dim, generator)
         carried = {"paired": canonical.paired, "mu0": canonical.mu0, "mu1": canonical.mu1}
         self.splats = Splats(canonical.gaussians, extra={"psi": psi}, carried=carried)
+        self._pairs: ObservedPairs | None = None
         self.screws = PartScrews(transforms)
         betas = canonical.betas if len(canonical.betas) == parts else canonical.betas[:1].expand(parts)
         self.register_buffer("times", (1.0 - betas).float().contiguous())
@@ -155,12 +157,12 @@ class ArticulationPhase(ImagePhase):
 
     def part_state(self, g: GaussianTensors, probs: Tensor) -> PartState:
         """The losses' view of this step."""
-        pairs = self.splats.paired.nonzero().squeeze(1)
-        mu0, mu1 = self.splats.mu0[pairs], self.splats.mu1[pairs]
-        target_rotation = None
-        if self._active("art") and pairs.numel() >= 3:
-            weights = probs.detach().T.index_select(1, pairs) + 1e-9
-            target_rotation = so3.kabsch(mu0, mu1, weights)[0]
+        observed = (self.splats.paired, self.splats.mu0, self.splats.mu1)
+        if self._pairs is None or not self._pairs.are_of(*observed):
+            self._pairs = ObservedPairs(*observed)
+        pairs, target_rotation = self._pairs, None
+        if self._active("art") and pairs.index.numel() >= 3:
+            target_rotation = pairs.rotations(probs)
         hardness = (self.config.temperature - self.temperature(self.step)) / max(
             self.config.temperature - self.config.temperature_end, 1e-9
         )
@@ -172,9 +174,9 @@ class ArticulationPhase(ImagePhase):
             canonical_time=float(self.times[0]) if uniform else self.times,
             extent=self.extent,
             spacing=float(self.spacing),
-            pairs=pairs,
-            mu0=mu0,
-            mu1=mu1,
+            pairs=pairs.index,
+            mu0=pairs.mu0,
+            mu1=pairs.mu1,
             knn=self.knn_index,
             target_rotation=target_rotation,
             repel_points=self.repel_points if len(self.repel_points) else None,

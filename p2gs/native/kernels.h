@@ -16,6 +16,7 @@
 #include "knn.h"
 #include "landing.h"
 #include "raster.h"
+#include "repel.h"
 #include "ssim.h"
 #include "views.h"
 
@@ -34,6 +35,7 @@ struct Kernels {
     ViewKernels views;
     EvidenceKernels evidence;
     AssignKernels assign;
+    RepelKernels repel;
 };
 
 namespace avx512 { extern const Kernels table; }

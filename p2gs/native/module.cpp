@@ -82,4 +82,5 @@ NB_MODULE(_native, m) {
     bind_motions(m);
     bind_views(m);
     bind_assign(m);
+    bind_repel(m);
 }

@@ -7,6 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from p2gs.native import native, num_threads
+
 Reduce = Literal["sum", "mean", "local"]
 
 
@@ -29,14 +31,17 @@ def repel_force(
     "mean" divides by R; "local" is the mean over the repel points nearer than ``radius``, and zero where there are none.
     The direction is the paper's: *towards* the repel points. In the residual x + F - target of the articulation loss the optimum
     x = target - F then lies away from them. Differentiable in both sets of points. Memory: ``chunk`` pairs at a time in the
-    forward pass (autograd keeps them all); "local" on the CPU visits only the pairs within the radius.
+    forward pass (autograd keeps them all); "local" on the CPU visits only the pairs within the radius, in float32 and without a gradient to
+    the repel points by a native kernel.
     Raises ValueError when "local" has no radius.
     """
     if reduce == "local" and (radius is None or radius <= 0):
         raise ValueError("repel_force(reduce='local') needs a positive radius")
     if points.shape[0] == 0 or repel_points.shape[0] == 0:
         return torch.zeros_like(points)
-    if reduce == "local" and points.device.type == "cpu":
+    if reduce == "local" and _native_applies(points, repel_points):
+        force = _Local.apply(points, repel_points, float(exponent), float(eps), float(radius))
+    elif reduce == "local" and points.device.type == "cpu":
         force = _local_sparse(points, repel_points, exponent, eps, radius)
     else:
         rows = max(1, chunk // repel_points.shape[0])
@@ -61,6 +66,34 @@ def _dense(points: Tensor, repel_points: Tensor, exponent: float, eps: float, re
         return pull.sum(1) if reduce == "sum" else pull.mean(1)
     near = (sq < radius * radius).to(pull.dtype)
     return (pull * near).sum(1) / near.sum(1).clamp_min(1)
+
+
+def _native_applies(points: Tensor, repel_points: Tensor) -> bool:
+    both = (points, repel_points)
+    return native is not None and not repel_points.requires_grad and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in both)
+
+
+class _Local(torch.autograd.Function):
+    """The slope of the force by the point comes with the force and waits for the backward pass."""
+
+    @staticmethod
+    def forward(ctx, points, repel_points, exponent, eps, radius):
+        points, repel_points = points.contiguous(), repel_points.contiguous()
+        pull, slope = torch.empty_like(points), torch.empty(len(points), 6)
+        native.repel_local(
+            points.data_ptr(), len(points), repel_points.data_ptr(), len(repel_points), radius, eps, exponent, pull.data_ptr(),
+            slope.data_ptr(), num_threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(slope)
+        return pull
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        xx, yy, zz, xy, xz, yz = ctx.saved_tensors[0].unbind(1)
+        x, y, z = grad.unbind(1)
+        back = torch.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], 1)
+        return back, None, None, None, None
 
 
 def _local_sparse(points: Tensor, repel_points: Tensor, exponent: float, eps: float, radius: float) -> Tensor:

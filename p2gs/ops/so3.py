@@ -150,6 +150,16 @@ def rotation_angle(A: Tensor, B: Optional[Tensor] = None) -> Tensor:
 
 
 @torch.no_grad()
+def nearest_rotation(H: Tensor) -> Tensor:
+    """The rotation R that makes trace(R H) greatest, never a reflection, [..., 3, 3]; H: sum of source times target transposed."""
+    U, _, Vh = torch.linalg.svd(H)
+    V, Ut = Vh.transpose(-1, -2), U.transpose(-1, -2)
+    flip = torch.ones_like(H[..., 0])
+    flip[..., 2] = torch.where(torch.linalg.det(V @ Ut) < 0, -1.0, 1.0)
+    return (V * flip[..., None, :]) @ Ut
+
+
+@torch.no_grad()
 def kabsch(src: Tensor, dst: Tensor, weights: Optional[Tensor] = None) -> tuple[Tensor, Tensor]:
     """The rigid motion minimising sum_n w_n |R src_n + t - dst_n|^2, never a reflection.
 
@@ -165,11 +175,7 @@ def kabsch(src: Tensor, dst: Tensor, weights: Optional[Tensor] = None) -> tuple[
     src, dst = src.transpose(-1, -2).contiguous(), dst.transpose(-1, -2).contiguous()
     src_mean, dst_mean = (w * src).sum(-1), (w * dst).sum(-1)
     H = (w * (src - src_mean[..., None])) @ (dst - dst_mean[..., None]).transpose(-1, -2)
-    U, _, Vh = torch.linalg.svd(H)
-    V, Ut = Vh.transpose(-1, -2), U.transpose(-1, -2)
-    flip = torch.ones_like(H[..., 0])
-    flip[..., 2] = torch.where(torch.linalg.det(V @ Ut) < 0, -1.0, 1.0)
-    R = (V * flip[..., None, :]) @ Ut
+    R = nearest_rotation(H)
     t = dst_mean - (R @ src_mean[..., None])[..., 0]
     empty = total <= 0
     return torch.where(empty[..., None], _eye_like(R), R), torch.where(empty, torch.zeros_like(t), t)

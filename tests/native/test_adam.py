@@ -149,3 +149,11 @@ def test_closure_and_names():
         NamedAdam([{"params": [param]}])
     with pytest.raises(ValueError, match="name of its own"):
         NamedAdam([{"params": [param], "name": "x"}, {"params": [torch.nn.Parameter(torch.ones(1))], "name": "x"}])
+
+
+@pytest.mark.parametrize("to_none", [True, False])
+def test_gradients_go(to_none):
+    params, optimizer = twins()[0]
+    give_gradients(params)
+    optimizer.zero_grad(set_to_none=to_none)
+    assert all(p.grad is None if to_none else not p.grad.any() for p in params.values())

@@ -50,6 +50,29 @@ def test_sparse_and_dense_local_force_are_one():
     torch.testing.assert_close(_local_sparse(x, r, 3, 1e-5, 0.4), _dense(x, r, 3, 1e-5, "local", 0.4))
 
 
+@pytest.mark.parametrize("exponent", [2, 3, 4.5])
+@pytest.mark.parametrize("sizes", [(1, 1), (5, 17), (300, 33), (65, 700)])
+def test_native_local_force_and_its_gradient(isa, threads, exponent, sizes):
+    x, r = cloud(sizes[0], 3), cloud(sizes[1], 4)
+    x[0] = r[0]  # in the sphere where the floor holds
+    arguments = dict(k_r=0.3, exponent=exponent, eps=0.05, reduce="local", tau_max=2.0, radius=0.7)
+    direction = cloud(sizes[0], 5)
+    ours, exact = x.float().requires_grad_(), x.requires_grad_()
+    force, expected = repel_force(ours, r.float(), **arguments), repel_force(exact, r, **arguments)
+    torch.testing.assert_close(force.double(), expected, rtol=1e-4, atol=1e-5)
+    (grad,) = torch.autograd.grad(force, ours, direction.float())
+    (expected,) = torch.autograd.grad(expected, exact, direction)
+    assert (grad - expected).norm() <= 1e-4 * expected.norm() + 1e-6
+
+
+def test_native_local_force_has_the_same_bits_for_any_number_of_threads(isa):
+    x, r, forces = cloud(999, 3).float(), cloud(500, 4).float(), []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        forces.append(repel_force(x, r, reduce="local", radius=0.5))
+    assert forces[0].any() and all(torch.equal(f, forces[0]) for f in forces)
+
+
 def test_force_turns_with_the_scene_and_does_not_see_translation():
     x, r = cloud(20, 5), cloud(30, 6)
     R, t = so3.rotvec_to_matrix(torch.tensor([0.4, -1.0, 2.0], dtype=F64)), torch.tensor([3.0, -1.0, 2.0], dtype=F64)
