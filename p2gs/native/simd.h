@@ -33,7 +33,7 @@ P2GS_INLINE const char* prefetch_lines(const char* p, int64_t bytes) {
 }
 
 // While one lives, results too small for a normal float are zero. On many machines each step in the subnormal range costs a hundred
-// others, and some numbers get there: products of finished pixels, blurred edges, the odds of parts that are ruled out.
+// others, and some numbers get there: products of finished pixels, gradients of parts that are as good as ruled out.
 struct FlushSubnormals {
 #if defined(__SSE2__)
     unsigned before = _mm_getcsr();
