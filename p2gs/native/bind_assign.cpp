@@ -20,7 +20,8 @@ void bind_assign(nb::module_& m) {
             nb::gil_scoped_release release;
             assign_forward(a, threads);
         },
-        "addresses (psi [n, dim], weight [parts, dim], bias [parts], probabilities out [parts, n]), n, dim, parts, 1 / temperature, threads");
+        "addresses (psi [n, dim], weight [parts, dim], bias [parts], probabilities out [parts, n]), n, dim, parts, "
+        "1 / temperature, threads");
     m.def(
         "assign_backward",
         [](const std::array<Address, 7>& at, int64_t n, int dim, int parts, float sharpness, int threads) {
@@ -31,7 +32,8 @@ void bind_assign(nb::module_& m) {
             nb::gil_scoped_release release;
             assign_backward(a, pointer<float>(at[5]), pointer<float>(at[6]), threads);
         },
-        "addresses (psi, weight, probabilities, gradient by them; gradients to psi, weight, bias), n, dim, parts, 1 / temperature, threads");
+        "addresses (psi, weight, probabilities, gradient by them; gradients to psi, weight, bias), n, dim, parts, "
+        "1 / temperature, threads");
 }
 
 }  // namespace p2gs
