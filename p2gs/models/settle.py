@@ -21,6 +21,9 @@ from p2gs.ops.sh import dc_to_rgb
 if TYPE_CHECKING:
     from p2gs.models.part_motions import PartMotionsConfig
 
+HOPELESS = 0.04  # share of image loss that refinement does not make good
+SETTLED = 0.005  # a round of settling that lowers the image loss by less is the last
+
 
 def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
     """Label and margin [N] of every Gaussian (also the faint ones) of both states."""
@@ -74,6 +77,9 @@ def reconsider(
                 continue
             costs = [cost_of(m) for _, m in proposed]
             part, tried = proposed[costs.index(min(costs))]
+            if min(costs) > cost * (1 + HOPELESS):
+                log.append({"change": change, "part": part, "type": tried.types[part], "before": cost, "tried": min(costs), "after": None})
+                continue
             refined = refine(states, tried, views, config.coarse, stacks, seed=seed, **options)
             reached, further = cost_of(refined), len(refined) > len(motions)
             if "split" in change:  # where the halves meet, geometry may know better once their motions are known
@@ -151,6 +157,8 @@ def settle_labels(
         if best[0] >= cost:
             break
         motions = settle_types(states, best[1], views, config, stacks, **options)
+        if best[0] > cost * (1 - SETTLED):
+            break
         cost = explanation_cost(states, motions, views, level, backend, device)
     return motions, rounds
 

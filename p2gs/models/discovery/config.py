@@ -22,7 +22,7 @@ class DiscoveryConfig:
     split: least share of its residual that half a part must lose with an amount of its own.
     min_mass: least share of the moved surface of a part.  min_moved: fewest moved surfels a state below which nothing moved.
     search_weight: weight of the search's own value beside the image-space violation when explanations are ranked.
-    candidates: how many complete explanations are handed back at most.
+    searches: how often the set is searched, each time among other samples.  candidates: best sets of each that are looked into.
     """
 
     surfels: int = 12000
@@ -42,4 +42,5 @@ class DiscoveryConfig:
     min_mass: float = 0.015
     min_moved: int = 12
     search_weight: float = 0.4
+    searches: int = 2
     candidates: int = 4

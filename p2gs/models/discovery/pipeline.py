@@ -18,7 +18,7 @@ from p2gs.models.discovery.finish import Explanation, settle_parts, split_amount
 from p2gs.models.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.models.discovery.labels import Graph, Labelling, label
 from p2gs.models.discovery.pool import plausibility
-from p2gs.models.discovery.problem import Problem, build_problem
+from p2gs.models.discovery.problem import Problem, build_problem, resampled
 from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
 from p2gs.models.discovery.rigid import Motions
 from p2gs.models.discovery.search import Search
@@ -59,18 +59,24 @@ def discover(
     explanations: list[Explanation] = []
     search = None
     if limit > 0 and max(map(len, problem.samples)) >= config.min_moved and min(map(len, problem.samples)) >= 3:
-        axes = directions(problem)
-        swept = sweep(problem, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in problem.samples])
-        still = static_axes(problem)
-        lap("hypotheses", 0.4)
-        search = Search(problem, swept, max(limit, config.max_parts - 1), config.part_cost)  # a bound cuts what is found, not the search
-        solutions = search.solve()
-        solutions += search.alternatives(solutions)
+        axes, still = directions(problem), static_axes(problem)
+        most = max(limit, config.max_parts - 1)  # a bound cuts what is found, not the search
+        sets: list[tuple[float, Motions]] = []
+        for number in range(max(config.searches, 1)):
+            looked = problem if number == 0 else resampled(problem, seed + number)
+            swept = sweep(looked, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in looked.samples])
+            one = Search(looked, swept, most, config.part_cost)
+            search = search or one
+            solutions = one.solve()
+            solutions += one.alternatives(solutions)
+            found = [(value, one.pool.motions[torch.tensor(chosen)]) for value, chosen in solutions if value > 0 and chosen]
+            sets += [f for f in found[: config.candidates] if not any(search.agree(f[1], other) for _, other in sets)]
+            tell("selection", 0.2 + 0.5 * (number + 1) / config.searches)
+            figures.setdefault("search", []).append(
+                {"axes": axes.tolist(), "motions_tried": len(swept.motions), **one.trace[-1]} if one.trace else {}
+            )
         lap("selection", 0.7)
-        figures |= {"axes": axes.tolist(), "motions_tried": len(swept.motions), "search": search.trace}
-        for value, chosen in solutions[: config.candidates]:
-            if value > 0 and chosen:
-                explanations.append(finish(problem, graphs, search.pool.motions[torch.tensor(chosen)], value, search.limit, limit, still))
+        explanations = [finish(problem, graphs, motions, value, most, limit, still) for value, motions in sets]
         explanations += again(problem, graphs, search, explanations, limit, still)
         explanations = ranked(search, explanations)
         lap("labels", 0.95)

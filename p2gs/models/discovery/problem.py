@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -160,14 +160,9 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
     both = torch.cat([s.points for s in surfels])
     lo, hi = both.min(0).values - 0.04 * diag, both.max(0).values + 0.04 * diag
     landings = [Landing(surfels[s], static[s], stacks[s], lo, hi, scale) for s in (0, 1)]
-    g = torch.Generator().manual_seed(seed)
-    samples = []
-    for s in (0, 1):
-        index = torch.nonzero(moved[s])[:, 0]
-        samples.append(index[spread_sample(surfels[s].points[index], config.samples, g)])
     trust = [credibility(surfels[s], surfels[1 - s], stacks[1 - s], moved[s], scale) for s in (0, 1)]
-    weights = [trust[s][samples[s]] / trust[s][samples[s]].sum().clamp_min(1e-9) for s in (0, 1)]
-    problem = Problem(config, scale, stacks, surfels, moved, static, landings, samples, weights, trust, (lo + hi) / 2, replaced)
+    problem = Problem(config, scale, stacks, surfels, moved, static, landings, [], [], trust, (lo + hi) / 2, replaced)
+    problem = resampled(problem, seed)
     figures = {
         "diag": diag,
         "noise": noise,
@@ -178,6 +173,17 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
         ],
     }
     return problem, figures
+
+
+def resampled(problem: Problem, seed: int) -> Problem:
+    """The problem with other moved surfels to look at."""
+    g = torch.Generator().manual_seed(seed)
+    samples, weights = [], []
+    for s in (0, 1):
+        index = torch.nonzero(problem.moved[s])[:, 0]
+        samples.append(index[spread_sample(problem.surfels[s].points[index], problem.config.samples, g)])
+        weights.append(problem.trust[s][samples[s]] / problem.trust[s][samples[s]].sum().clamp_min(1e-9))
+    return replace(problem, samples=samples, weights=weights)
 
 
 def spread_sample(points: Tensor, n: int, generator: torch.Generator) -> Tensor:
