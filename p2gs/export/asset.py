@@ -12,6 +12,7 @@ from p2gs.export.convex import Piece, decompose, intersect
 from p2gs.export.mesh import read_meshes, write_meshes
 from p2gs.export.tsdf import Mesh, vertex_normals
 from p2gs.export.twin_json import load_twin
+from p2gs.export.unique_rows import unique_rows
 from p2gs.models.joint_range import extend_ranges
 from p2gs.types import Joint, UserError
 
@@ -240,13 +241,12 @@ def cluster(mesh: Mesh, cell: float) -> Mesh:
     side = np.abs(normal).argmax(1)
     side = 2 * side + (normal[rows, side] > 0)
     key = np.c_[np.floor((mesh.vertices - mesh.vertices.min(0)) / cell).astype(np.int64), side]
-    _, label = np.unique(key, axis=0, return_inverse=True)
-    label = label.reshape(-1)
+    _, label = unique_rows(key)
     count = np.bincount(label).astype(float)
     vertices = np.stack([np.bincount(label, mesh.vertices[:, i]) for i in range(3)], 1) / count[:, None]
     colours = np.stack([np.bincount(label, mesh.colours[:, i].astype(float)) for i in range(3)], 1) / count[:, None]
     faces = label[mesh.faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    faces = faces[np.unique(np.sort(faces, 1), axis=0, return_index=True)[1]]
+    faces = faces[unique_rows(np.sort(faces, 1))[0]]
     used, renumbered = np.unique(faces, return_inverse=True)
     return Mesh(vertices[used], renumbered.reshape(-1, 3), colours[used].round().astype(np.uint8))

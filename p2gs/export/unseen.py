@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from p2gs.export.tsdf import DepthView, Mesh, pixel_matrix, pixels, seen_points
+from p2gs.export.unique_rows import unique_rows
 
 NEAR = 4.0  # voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges
 LEAST = 0.2  # share of a side of the box that must be unseen for it to be closed
@@ -87,8 +88,8 @@ def _plane(points: np.ndarray, area: np.ndarray, colours: np.ndarray, sign: floa
 def _open_vertices(faces: np.ndarray) -> np.ndarray:
     """Indices of the vertices on edges that only one triangle has."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    edges, count = np.unique(edges, axis=0, return_counts=True)
-    return np.unique(edges[count == 1])
+    first, which = unique_rows(edges)
+    return np.unique(edges[first[np.bincount(which) == 1]])
 
 
 def _sewn(mesh: Mesh, plane: Mesh, reach: float) -> Mesh:

@@ -41,6 +41,19 @@ def si(joint):
     return math.radians(joint["motion"]) if joint["type"] == "revolute" else joint["motion"]
 
 
+def test_collision_pieces_are_made_once_and_only_for_formats_that_hold_them(run, tmp_path, monkeypatch):
+    from p2gs.export import asset
+
+    made = []
+    monkeypatch.setattr(asset, "decompose", lambda *a: made.append(1) or decompose(*a))
+    export_run(run, ["glb", "obj", "ply"], tmp_path)
+    assert not made
+    export_run(run, ["urdf", "mjcf", "glb"], tmp_path)
+    assert len(made) == 3  # a part each
+    for name in ("twin.urdf", "twin.xml", "twin.glb"):
+        assert (tmp_path / name).read_bytes() == (run / name).read_bytes()
+
+
 def test_urdf_opens_in_yourdfpy_and_agrees_with_the_twin(run, joints):
     import yourdfpy
 
