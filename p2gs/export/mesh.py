@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from p2gs.export.depth_view import DepthView, add_normals
 from p2gs.export.paint import draw, rasterizer_of
 from p2gs.export.pose import part_transform, pose
-from p2gs.export.tsdf import DepthView, Mesh, add_normals, fuse, largest_components
+from p2gs.export.tsdf import Mesh, fuse, largest_components
 from p2gs.export.twin_json import load_twin
 from p2gs.export.unseen import close_unseen_sides
 from p2gs.export.views import NamedCamera, bounds, orbit, read_cameras

@@ -8,32 +8,16 @@ point-to-plane distances: the difference in depth times the cosine between ray a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional, Sequence
+from typing import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from p2gs.types import Camera
+from p2gs.export.depth_view import DepthView, pixel_matrix, seen_points
+from p2gs.export.integrate import integrate
 
 BLOCK = 4  # voxels; active space is kept in cubes of this side
-CHUNK = 1 << 16  # voxels
-FREE_WEIGHT = 0.3  # of a view that sees through a voxel, against 1 of a view that sees surface in it head-on and for sure
-
-
-@dataclass
-class DepthView:
-    """What one view saw.
-
-    depth [H, W] along z, 0 where nothing was hit.  labels [H, W] int64 part id, -1 where nothing.  colour [H, W, 3] in 0..1.
-    """
-
-    camera: Camera
-    depth: Tensor
-    labels: Tensor
-    colour: Tensor
-    normal_dot: Optional[Tensor] = None  # [H, W] |n . ray| for a ray of unit z; distance to the surface's plane per unit of depth
-    cosine: Optional[Tensor] = None  # [H, W] weight of the sighting: between ray and normal, 0 where the depth has an edge
 
 
 @dataclass
@@ -63,42 +47,6 @@ class Mesh:
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.uint8))
 
 
-def camera_rays(camera: Camera) -> Tensor:
-    """Directions of unit z through the pixel centres, camera coordinates, [H, W, 3] float32."""
-    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    pixels = torch.stack([u, v, torch.ones_like(u)], -1).double()
-    return (pixels @ torch.linalg.inv(camera.K.double()).T).float()
-
-
-def add_normals(view: DepthView, edge: float) -> DepthView:
-    """Fill ``normal_dot`` and ``cosine`` from the depth map. edge: neighbours further apart in depth than this are another surface."""
-    rays = camera_rays(view.camera)
-    p, d = rays * view.depth[..., None], view.depth
-    pad = torch.nn.functional.pad(p.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0].permute(1, 2, 0)
-    dx, dy = pad[1:-1, 2:] - pad[1:-1, :-2], pad[2:, 1:-1] - pad[:-2, 1:-1]
-    n = torch.nn.functional.normalize(torch.linalg.cross(dx, dy), dim=-1)
-    dot = (n * rays).sum(-1).abs()
-    # a plane seen at an angle changes depth too: an edge is where both neighbours are off the straight line between them
-    near = torch.nn.functional.pad(d[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    bend = torch.maximum((near[1:-1, 2:] + near[1:-1, :-2] - 2 * d).abs(), (near[2:, 1:-1] + near[:-2, 1:-1] - 2 * d).abs())
-    hole = (near[1:-1, 2:] == 0) | (near[1:-1, :-2] == 0) | (near[2:, 1:-1] == 0) | (near[:-2, 1:-1] == 0)
-    cosine = dot / rays.norm(dim=-1)
-    view.normal_dot, view.cosine = dot, torch.where((bend > edge) | hole | (d == 0) | (cosine < 0.1), torch.zeros_like(dot), cosine)
-    return view
-
-
-def seen_points(view: DepthView, part: int, start_to_world: Tensor, stride: int = 1) -> Tensor:
-    """Where the view saw the part, in the part's start-state coordinates, [M, 3] float64."""
-    mask = (view.labels == part) & (view.cosine > 0)
-    if stride > 1:
-        keep = torch.zeros_like(mask)
-        keep[::stride, ::stride] = True
-        mask &= keep
-    x = (camera_rays(view.camera)[mask] * view.depth[mask][:, None]).double()
-    M = view.camera.viewmat.double() @ start_to_world
-    return (x - M[:3, 3]) @ M[:3, :3]
-
-
 def fuse(views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, trunc: float, behind: float) -> Mesh:
     """The part's surface in its start-state pose.
 
@@ -110,58 +58,9 @@ def fuse(views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: 
     if len(points) < 50:
         return Mesh.empty()
     grid = ActiveGrid.around(points, voxel)
-    maps = [_pixel_table(v, part) for v in views]
-    matrices = [pixel_matrix(v.camera, T).float() for v, T in zip(views, poses, strict=True)]
-    chunks = grid.centers().split(CHUNK)  # small enough to stay in cache through all views
-    field, weight, colour = (torch.cat(x) for x in zip(*(_integrate(x, views, maps, matrices, trunc, behind) for x in chunks), strict=True))
+    matrices = [pixel_matrix(v.camera, T) for v, T in zip(views, poses, strict=True)]
+    field, weight, colour = integrate(grid.centers(), views, matrices, part, trunc, behind)
     return grid.surface(field, weight > 0, colour)
-
-
-def pixel_matrix(camera: Camera, T: Tensor) -> Tensor:
-    """[3, 4] float64: coordinates that the pose T [4, 4] carries to the world -> pixels times depth."""
-    return camera.K.double() @ (camera.viewmat.double() @ T)[:3]
-
-
-def pixels(columns: Tensor, M: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Depth [n] and flat pixel [n] of points [3, n] under ``pixel_matrix`` M; the pixel is H W outside the image."""
-    width, height = camera.width, camera.height
-    p = torch.addmm(M[:, 3:], M[:, :3], columns)
-    z = p[2]
-    u, v = p[:2] / z.clamp_min(1e-6)
-    pixel = v.clamp(0, height - 1).long() * width + u.clamp(0, width - 1).long()
-    outside = (z < 1e-4) | (u < 0) | (v < 0) | (u >= width) | (v >= height)
-    return z, pixel.masked_fill_(outside, width * height)
-
-
-def _pixel_table(view: DepthView, part: int) -> Tensor:
-    """[H W + 1, 6] float32 a pixel: depth (1e9 where nothing is), |n . ray|, cosine on this part (else 0), RGB. The last row: outside."""
-    depth = torch.where(view.labels < 0, torch.full_like(view.depth, 1e9), view.depth)
-    cosine = torch.where(view.labels == part, view.cosine, torch.zeros_like(view.cosine))
-    table = torch.cat([depth[..., None], view.normal_dot.clamp_min(0.05)[..., None], cosine[..., None], view.colour], -1).reshape(-1, 6)
-    return torch.cat([table, torch.tensor([[-1e9, 1.0, 0, 0, 0, 0]])])
-
-
-def _integrate(x: Tensor, views, maps, matrices, trunc: float, behind: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Signed distance in units of trunc [n], weight of surface sightings [n] and colour [n, 3] at points x [n, 3]."""
-    total, weight = torch.zeros(len(x)), torch.full((len(x),), 1e-9)
-    tint = torch.full((len(x), 4), 1e-9)
-    columns = x.T.contiguous()
-    for view, table, M in zip(views, maps, matrices, strict=True):
-        z, pixel = pixels(columns, M, view.camera)
-        row = table.index_select(0, pixel)
-        gap = row[:, 0] - z
-        d = gap * row[:, 1]
-        free = (gap > trunc) & (d > 0.5 * trunc)
-        near = (~free & (d > -behind)) * row[:, 2]
-        w = torch.where(free, FREE_WEIGHT, near)
-        weight += w
-        total += w * (d / trunc).clamp_(-1, 1).masked_fill_(free, 1.0)
-        # colour from sightings right at the voxel: those of a thin wall's other side are only a few voxels away
-        near *= (d < trunc) * torch.exp(-((4 * d / trunc) ** 2)).clamp_min_(1e-4)
-        tint[:, 0] += near
-        tint[:, 1:] += near[:, None] * row[:, 3:]
-    seen = tint[:, 0]
-    return total / weight, torch.where(seen > 1e-7, seen, torch.zeros_like(seen)), tint[:, 1:] / seen[:, None]
 
 
 @dataclass

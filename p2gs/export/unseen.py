@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from p2gs.export.tsdf import DepthView, Mesh, pixel_matrix, pixels, seen_points
+from p2gs.export.depth_view import DepthView, pixel_matrix, pixels, seen_points
+from p2gs.export.tsdf import Mesh
 from p2gs.export.unique_rows import unique_rows
 
 NEAR = 4.0  # voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges

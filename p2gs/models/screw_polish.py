@@ -14,7 +14,7 @@ from torch import Tensor
 from p2gs.data.views import TrainingViews, view_index
 from p2gs.models.phase import exponential
 from p2gs.ops import se3, so3
-from p2gs.ops.sh import rotate_sh
+from p2gs.ops.carry import Parts, carry
 from p2gs.ops.ssim import l1_ssim
 from p2gs.render import rasterize
 from p2gs.types import Camera, GaussianTensors
@@ -61,26 +61,14 @@ class MovedGaussians:
         self.scales = self.g.log_scales.exp()
         self.opacities = torch.sigmoid(self.g.opacity_logits)
         self.quats = so3.quat_normalize(self.g.quats)
-        self.parts = int(labels.max().item()) if labels.numel() else 0
+        self.bodies = Parts(self.labels)
 
     def rows(self, part: int) -> Tensor:
         return (self.labels == part).nonzero().squeeze(1)
 
     def moved(self, transforms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Means [N, 3], quats [N, 4] and SH [N, B, 3] after the motions; transforms [K-1, 4, 4]."""
-        transforms = transforms.float().to(self.device)
-        T = torch.cat([torch.eye(4, device=self.device)[None], transforms])[self.labels]
-        R = T[:, :3, :3]
-        means = torch.einsum("nij,nj->ni", R, self.g.means) + T[:, :3, 3]
-        turn = so3.matrix_to_quat(torch.cat([torch.eye(3, device=self.device)[None], transforms[:, :3, :3]]))[self.labels]
-        quats = so3.quat_multiply(turn, self.quats)
-        sh = self.g.sh
-        if sh.shape[1] > 1:
-            sh = sh.clone()
-            for k in range(len(transforms)):
-                rows = self.rows(k + 1)
-                sh[rows] = rotate_sh(sh[rows], transforms[k, :3, :3])
-        return means, quats, sh
+        return carry(self.g.means, self.quats, self.g.sh, self.bodies, transforms)
 
     def render(self, means: Tensor, quats: Tensor, sh: Tensor, camera: Camera, background: Tensor, backend: str, features=None):
         camera, background = camera.to(self.device), background.to(self.device)

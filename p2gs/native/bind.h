@@ -19,11 +19,13 @@ T* pointer(Address a) {
 
 void bind_adam(nb::module_& m);
 void bind_blend(nb::module_& m);
+void bind_carry(nb::module_& m);
 void bind_image(nb::module_& m);
 void bind_ssim(nb::module_& m);
 void bind_knn(nb::module_& m);
 void bind_evidence(nb::module_& m);
 void bind_motions(nb::module_& m);
+void bind_fuse(nb::module_& m);
 void bind_graph(nb::module_& m);
 void bind_views(nb::module_& m);
 void bind_landing(nb::module_& m);

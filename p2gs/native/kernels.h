@@ -10,7 +10,9 @@
 #include "adam.h"
 #include "assign.h"
 #include "blend.h"
+#include "carry.h"
 #include "evidence.h"
+#include "fuse.h"
 #include "graph.h"
 #include "image.h"
 #include "knn.h"
@@ -26,6 +28,7 @@ struct Kernels {
     const char* isa;
     AdamKernels adam;
     BlendKernels blend;
+    CarryKernels carry;
     ImageKernels image;
     SsimKernels ssim;
     RasterKernels raster;
@@ -36,6 +39,7 @@ struct Kernels {
     EvidenceKernels evidence;
     AssignKernels assign;
     RepelKernels repel;
+    FuseKernels fuse;
 };
 
 namespace avx512 { extern const Kernels table; }

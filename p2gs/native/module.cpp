@@ -72,11 +72,13 @@ NB_MODULE(_native, m) {
         "Run `chunks` counting chunks of `work` steps; the number done, -1 where one was not done exactly once (for tests).");
     bind_adam(m);
     bind_blend(m);
+    bind_carry(m);
     bind_image(m);
     bind_ssim(m);
     bind_raster(m);
     bind_knn(m);
     bind_landing(m);
+    bind_fuse(m);
     bind_graph(m);
     bind_evidence(m);
     bind_motions(m);

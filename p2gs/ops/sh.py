@@ -80,7 +80,7 @@ def evaluate(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tenso
 
 
 @lru_cache(maxsize=None)
-def _collocation(band: int) -> tuple[Tensor, Tensor]:
+def band_tables(band: int) -> tuple[Tensor, Tensor]:
     """Directions [4 band + 8, 3] and the pseudo-inverse of this band's bases there [2 band + 1, 4 band + 8], float64.
 
     The directions are a Fibonacci spiral: well spread, so the inverse is well conditioned.
@@ -99,7 +99,7 @@ def rotation_matrices(R: Tensor, degree: int) -> list[Tensor]:
     num_bases(degree)
     out = [torch.ones_like(R[..., :1, :1])]
     for band in range(1, degree + 1):
-        directions, inverse = (a.to(R) for a in _collocation(band))
+        directions, inverse = (a.to(R) for a in band_tables(band))
         # the turned function at d is the old one at R^T d, and rows d @ R are R^T d
         turned = basis(band, directions @ R)[..., band * band :]
         out.append(inverse @ turned)
