@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Optional
 
 import torch
@@ -27,10 +28,15 @@ class DepthView:
 
 
 def camera_rays(camera: Camera) -> Tensor:
-    """Directions of unit z through the pixel centres, camera coordinates, [H, W, 3] float32."""
-    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    """Directions of unit z through the pixel centres, camera coordinates, [H, W, 3] float32. Not to be written to."""
+    return _rays(tuple(camera.K.double().flatten().tolist()), camera.width, camera.height)
+
+
+@lru_cache(maxsize=2)  # the views of a scene mostly share their intrinsics
+def _rays(K: tuple[float, ...], width: int, height: int) -> Tensor:
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack([u, v, torch.ones_like(u)], -1).double()
-    return (pixels @ torch.linalg.inv(camera.K.double()).T).float()
+    return (pixels @ torch.linalg.inv(torch.tensor(K, dtype=torch.float64).reshape(3, 3)).T).float()
 
 
 def add_normals(view: DepthView, edge: float) -> DepthView:

@@ -18,6 +18,7 @@ from p2gs.export.tsdf import Mesh, fuse, largest_components
 from p2gs.export.twin_json import load_twin
 from p2gs.export.unseen import close_unseen_sides
 from p2gs.export.views import NamedCamera, bounds, orbit, read_cameras
+from p2gs.ops.blend import likeliest
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, UserError
 
 STATES = ("start", "end")
@@ -64,7 +65,7 @@ def look(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera, nea
     alpha = out.alpha.clamp_min(1e-3)
     return PartView(
         depth=torch.where(solid, torch.where((mean - median).abs() < near, mean, median), torch.zeros_like(mean)),
-        label=torch.where(solid, torch.cat(shares, -1).argmax(-1), torch.full_like(solid, -1, dtype=torch.int64)),
+        label=torch.where(solid, likeliest(torch.cat(shares, -1).flatten(0, 1)).reshape(solid.shape), -1),
         colour=(out.colour / alpha[..., None]).clamp(0, 1),
         alpha=out.alpha,
         spread=out.depth_variance.clamp_min(0).sqrt() / alpha,

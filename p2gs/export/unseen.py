@@ -56,12 +56,14 @@ def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[T
             within = points.copy()
             within[:, axis] -= outward * voxel
             solid = ~seen_empty(torch.as_tensor(within), views, poses, clearance).numpy()
-            distance, nearest = tree.query(points)
+            distance = tree.query(points, distance_upper_bound=1.001 * NEAR * voxel)[0]  # infinite beyond
             if (solid & (distance > NEAR * voxel)).mean() < LEAST:
                 continue
             area = solid.reshape(shape)
             if _touching(area, (distance < NEAR * voxel).reshape(shape)) >= RIM:
-                planes.append(_plane(points, area, mesh.colours[nearest], outward * (-1) ** axis))
+                colours = np.zeros((len(points), 3), mesh.colours.dtype)
+                colours[solid] = mesh.colours[tree.query(points[solid])[1]]
+                planes.append(_plane(points, area, colours, outward * (-1) ** axis))
     for plane in planes:
         mesh = _sewn(mesh, plane, NEAR * voxel)
     return mesh

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -117,5 +118,5 @@ def rotate_sh(sh: Tensor, R: Tensor, index: Tensor | None = None) -> Tensor:
     for band, M in enumerate(rotation_matrices(R, degree)):
         M = M if index is None else M[index]
         bands.append(M @ sh[..., band * band : (band + 1) ** 2, :])
-    shape = torch.broadcast_shapes(*(b.shape[:-2] for b in bands))
+    shape = np.broadcast_shapes(*(b.shape[:-2] for b in bands))  # torch's own imports sympy, which takes a second
     return torch.cat([b.expand(*shape, *b.shape[-2:]) for b in bands], -2)

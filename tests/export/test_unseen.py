@@ -11,7 +11,8 @@ from toy import ring
 from p2gs.data.furniture import box
 from p2gs.data.raytrace import trace
 from p2gs.data.textures import Texture
-from p2gs.export.tsdf import DepthView, Mesh, add_normals, fuse
+from p2gs.export.depth_view import DepthView, add_normals
+from p2gs.export.tsdf import Mesh, fuse
 from p2gs.export.unseen import close_unseen_sides, seen_empty
 
 EYE = torch.eye(4, dtype=torch.float64)
