@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
+from p2gs.models.part_pull import part_pulls
 from p2gs.models.phase import exponential
 from p2gs.ops import se3, so3
 from p2gs.ops.carry import Parts, carry
@@ -88,20 +89,6 @@ class MovedGaussians:
         )
 
 
-def tangent_gradient(means: Tensor, quats: Tensor, grad_means: Tensor, grad_quats: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Each point's share of the gradient of a loss by a small rotation about ``centre`` and a small translation of points already moved.
-
-    means, grad_means [n, 3]; quats, grad_quats [n, 4]; centre [3] or [n, 3].  Returns (rotation [n, 3], translation [n, 3]), float64: their
-    sums are the gradient. A rotation by w turns a quaternion q into q + 0.5 (0, w) q.
-    """
-    grad_means, grad_quats = grad_means.double(), grad_quats.double()
-    rotation = torch.linalg.cross(means.double() - centre, grad_means)
-    w, v = quats[:, :1].double(), quats[:, 1:].double()
-    # (0, e_j) * q = (-v_j, w e_j + e_j x v), contracted with the gradient of q
-    g0, gv = grad_quats[:, :1], grad_quats[:, 1:]
-    return rotation + 0.5 * (-g0 * v + w * gv + torch.linalg.cross(v, gv)), grad_means
-
-
 def allowed_step(kinds: list[str], T: Tensor, centre: Tensor, radius: Tensor, step: Tensor) -> Tensor:
     """Project tangent steps [K, 6] = (rotation * radius, translation) at ``centre`` [K, 3] onto the motions of the joints' types.
 
@@ -170,9 +157,7 @@ def polish(
         labels = torch.where(solid, side.labels, -1)
         bodies.append(MovedGaussians(side.gaussians, labels, device))
         fronts.append(None if side.seen_from is None else side.seen_from[labels >= 0].to(device))
-    rows = [(body.labels > 0).nonzero().squeeze(1) for body in bodies]
-    parts = [body.labels[r] - 1 for body, r in zip(bodies, rows, strict=True)]
-    enough = [torch.bincount(p, minlength=len(types)).cpu() >= 10 for p in parts]
+    enough = [torch.bincount(body.labels, minlength=len(types) + 1)[1:].cpu() >= 10 for body in bodies]
     slides = torch.tensor([kind == "prismatic" for kind in types])
     anchors, radius = _anchors(sides, bodies, transforms)
     first, second = torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
@@ -181,7 +166,7 @@ def polish(
     total = config.steps * len(sides)
     for step in range(total):
         turn, number = step % len(sides), step // len(sides)
-        side, body, fraction, r, part = sides[turn], bodies[turn], step / total, rows[turn], parts[turn]
+        side, body, fraction = sides[turn], bodies[turn], step / total
         generator = torch.Generator().manual_seed((seed + side.back) * 1_000_003 + number)
         background = torch.rand(3, generator=generator)
         index = view_index(seed + side.back + 13, number, len(side.views))
@@ -195,13 +180,9 @@ def polish(
         if fraction >= 0.9:
             losses[turn].append(float(loss.detach()))
         centre = se3.apply(transforms, anchors[:, None])[:, 0]
-        at = [means.detach()[r], quats.detach()[r], means.grad[r], quats.grad[r]]
-        pulls = torch.cat(tangent_gradient(*at, (anchors if side.back else centre).to(means.device)[part]), 1)
-        if fronts[turn] is not None and config.front > -1:
-            back = transforms[:, :3, :3].transpose(1, 2) if side.back else transforms[:, :3, :3]
-            front = facing(fronts[turn][r], back.to(means)[part], at[0], shot.camera) >= config.front
-            pulls = pulls * front[:, None]
-        gradient = pulls.new_zeros(len(types), 6).index_add_(0, part, pulls).cpu()
+        back = transforms[:, :3, :3].transpose(1, 2) if side.back else transforms[:, :3, :3]
+        limit = (fronts[turn], back, shot.camera.position, config.front) if fronts[turn] is not None and config.front > -1 else None
+        gradient = part_pulls(means, quats, body.bodies, anchors if side.back else centre, limit)
         if side.back:
             gradient = -torch.cat([(transforms[:, :3, :3] @ g[..., None])[..., 0] for g in gradient.split(3, 1)], 1)
         gradient[:, :3] /= radius[:, None]
@@ -219,16 +200,6 @@ def polish(
         if kind == "revolute":
             transforms[k] = se3.project_revolute(transforms[k])  # what pitch the last steps left
     return transforms, [sum(of) / max(len(of), 1) for of in losses]
-
-
-def facing(seen_from: Tensor, rotation: Tensor, means: Tensor, camera: Camera) -> Tensor:
-    """Cosine [n] between the direction from moved points ``means`` [n, 3] to the camera and their ``seen_from`` [n, 3], turned by
-    ``rotation`` [3, 3] or [n, 3, 3].
-
-    The back of a door's front face, seen through an opened door, stands a door's thickness before the inner face in the photograph.
-    """
-    way = torch.nn.functional.normalize(camera.position.to(means) - means, dim=1)
-    return ((rotation.to(means) @ seen_from[..., None])[..., 0] * way).sum(1)
 
 
 def _anchors(sides, bodies, transforms: Tensor) -> tuple[Tensor, Tensor]:

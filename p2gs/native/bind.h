@@ -29,6 +29,7 @@ void bind_fuse(nb::module_& m);
 void bind_graph(nb::module_& m);
 void bind_views(nb::module_& m);
 void bind_landing(nb::module_& m);
+void bind_pull(nb::module_& m);
 void bind_raster(nb::module_& m);
 void bind_repel(nb::module_& m);
 void bind_assign(nb::module_& m);

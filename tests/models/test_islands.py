@@ -8,8 +8,9 @@ from tiny import hinge, look_at, slide
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import PartMotions
 from p2gs.models.islands import find_islands, pieces, settle_islands, settle_twin_islands
+from p2gs.models.part_pull import facing
 from p2gs.models.refine_motions import leave_false_minima, survey
-from p2gs.models.screw_polish import PolishConfig, facing
+from p2gs.models.screw_polish import PolishConfig
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors
 
@@ -98,8 +99,8 @@ def test_seen_from_is_the_mean_direction_to_the_cameras_that_see_a_point():
 def test_facing_turns_with_the_part():
     camera = look_at(torch.tensor([3.0, 0.0, 0.0]), 32)
     x, z = torch.tensor([[1.0, 0.0, 0.0]]), se3.from_screw(torch.tensor([0.0, 0, 1]), torch.zeros(3), torch.pi)[:3, :3]
-    assert float(facing(x, torch.eye(3), torch.zeros(1, 3), camera)) == pytest.approx(1.0)
-    assert float(facing(x, z, torch.zeros(1, 3), camera)) == pytest.approx(-1.0, abs=1e-6)
+    assert float(facing(x, torch.eye(3), torch.zeros(1, 3), camera.position)) == pytest.approx(1.0)
+    assert float(facing(x, z, torch.zeros(1, 3), camera.position)) == pytest.approx(-1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("kind, truth", [("prismatic", slide()), ("revolute", hinge())])

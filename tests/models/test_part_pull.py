@@ -1,0 +1,39 @@
+"""How Gaussians pull at their parts: native code against torch in float64."""
+
+import pytest
+import torch
+
+from p2gs.models.part_pull import part_pulls, part_pulls_reference
+from p2gs.native import native, why_missing
+from p2gs.ops import so3
+from p2gs.ops.carry import Parts
+
+pytestmark = pytest.mark.skipif(native is None, reason=str(why_missing))
+
+
+def setting(n, dtype=torch.float32):
+    g = torch.Generator().manual_seed(n)
+    means, quats, a, b, seen = (torch.randn(n, k, generator=g).to(dtype) for k in (3, 4, 3, 4, 3))
+    quats = torch.nn.functional.normalize(quats, dim=1)
+    means.grad, quats.grad = a, b
+    labels = torch.randint(0, 4, (n,), generator=g)
+    labels[labels == 2] = 0  # a part without Gaussians
+    turns = so3.rotvec_to_matrix(torch.randn(3, 3, generator=g).double())
+    return means, quats, Parts(labels), torch.randn(3, 3, generator=g).double(), (seen, turns, torch.tensor([0.3, 2.0, -1.0]), 0.2)
+
+
+@pytest.mark.parametrize("n", [0, 1, 40, 3000])
+@pytest.mark.parametrize("limited", [False, True])
+def test_follows_torch(n, limited):
+    means, quats, parts, centres, limit = setting(n)
+    ours = part_pulls(means, quats, parts, centres, limit if limited else None)
+    exact = setting(n)
+    wide = [t.double() for t in exact[:2]]
+    for t, narrow in zip(wide, exact[:2], strict=True):
+        t.grad = narrow.grad.double()
+    seen, turns, eye, least = limit
+    want = part_pulls_reference(*wide, parts, centres, (seen.double(), turns, eye.double(), least) if limited else None)
+    assert ours.dtype == want.dtype == torch.float64 and ours.shape == (3, 6)
+    assert torch.allclose(ours, want, atol=1e-5) and not ours[1].any()
+    if limited and n > 1000:
+        assert not torch.allclose(ours, part_pulls(means, quats, parts, centres), atol=0.1)
