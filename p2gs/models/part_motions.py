@@ -38,8 +38,9 @@ class PartMotionsConfig:
     surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.  reconsider: each part's motion, and
     one more, is searched again amid the others, refined; missing_penalty: relative image loss by which a part that comes so must win;
     missing_confidence, missing_evidence: confidence and evidence that it must have (``reconsider``).  split_reach: a part is tried as two
-    whose motions differ by up to twice this (internal units; 0 = never), also with a part left out whose evidence is below ``doubtful``.
-    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
+    whose motions differ by up to twice this (internal units; 0 = never) where that saves ``split`` of its residual; also with a part left
+    out whose evidence is below ``doubtful``.  min_confidence: a part of less
+    confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
 
     evidence_size: int = 200
@@ -59,6 +60,7 @@ class PartMotionsConfig:
     missing_confidence: float = 0.3
     missing_evidence: float = 0.005
     split_reach: float = 0.05
+    split: float = 0.12
     doubtful: float = 0.1
     min_confidence: float = 0.02
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)

@@ -14,7 +14,6 @@ from torch import Tensor
 from p2gs.data.views import TrainingViews
 from p2gs.models.discovery.labels import Graph, smooth_labels
 from p2gs.models.handover import PartMotions
-from p2gs.models.refine_motions import explanation_cost
 from p2gs.models.screw_polish import MovedGaussians
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
@@ -22,7 +21,7 @@ from p2gs.ops.sh import dc_to_rgb
 from p2gs.types import GaussianTensors
 
 FEWEST = 10  # solid Gaussians in each state that a half must have
-SHIFTS = (0.0, 0.08, 0.16, 0.25, 0.5, 0.75, 1.0)  # amounts tried to both sides, of the reach: fine near the one that is known
+STEPS = 9  # amounts tried
 SPREAD = 12  # rounds of averaging over neighbours
 
 
@@ -111,10 +110,12 @@ def rim(states, motions: PartMotions, part: int) -> float:
     return max(float(away.mean()), 1e-2) if len(away) else 1.0
 
 
-def split_part(states, motions: PartMotions, part: int, costs: list[tuple[Tensor, Tensor]], shifts: list[float]) -> PartMotions | None:
-    """The part as two, by the pair of amounts that leaves least of its residual. costs: of ``amount_costs``.
+def split_part(
+    states, motions: PartMotions, part: int, costs: list[tuple[Tensor, Tensor]], shifts: list[float], apart: int = 1
+) -> tuple[float, PartMotions] | None:
+    """The part as two by the best pair of amounts, and the share of its residual that this saves against the best single amount.
 
-    None where a half would have next to nothing in a state.
+    costs: of ``amount_costs``.  apart: least difference of the amounts, in steps.  None where a half would have next to nothing in a state.
     """
     rows = [((motions.labels[s] == part + 1) & (costs[s][1].amax(1) > 0)).nonzero().squeeze(1) for s in (0, 1)]
     if min(map(len, rows)) < 2 * FEWEST:
@@ -133,8 +134,10 @@ def split_part(states, motions: PartMotions, part: int, costs: list[tuple[Tensor
         cost, mass = 0.5 * cost + 0.5 * graph.average(cost), 0.5 * mass + 0.5 * graph.average(mass)
     cost = cost / mass
     w = (weight / weight.sum())[:, 0]
+    single = (w @ cost).min()
     pairs = torch.stack([w @ torch.minimum(cost, cost[:, i : i + 1]) for i in range(len(shifts))])
-    a, b = divmod(int(pairs.fill_diagonal_(torch.inf).argmin()), len(shifts))
+    near = (torch.arange(len(shifts))[:, None] - torch.arange(len(shifts))).abs() < apart
+    a, b = divmod(int(torch.where(near, torch.inf, pairs).argmin()), len(shifts))
     scale = float((w * (cost[:, a] - cost[:, b]).abs()).sum().clamp_min(1e-6))
     second = smooth_labels(cost[:, [a, b]] / (3 * scale), graph).argmax(1) == 1
     halves = second.split([len(r) for r in rows])
@@ -150,20 +153,20 @@ def split_part(states, motions: PartMotions, part: int, costs: list[tuple[Tensor
     parted = motions.with_motion(part, kind, with_amount(T, kind, shifts[a], arm))
     parted = parted.with_motion(len(motions), kind, with_amount(T, kind, shifts[b], arm))
     confidence = torch.cat([motions.confidence, motions.confidence[part : part + 1]])
-    return replace(parted, labels=labels, confidence=confidence)
+    return float((single - pairs[a, b]) / single.clamp_min(1e-9)), replace(parted, labels=labels, confidence=confidence)
 
 
-def splits(states, motions: PartMotions, views, reach: float, *, level: int, backend: str, device="cpu") -> list[tuple[int, PartMotions]]:
+def splits(
+    states, motions: PartMotions, views, reach: float, least: float, *, level: int, backend: str, device="cpu"
+) -> list[tuple[int, PartMotions]]:
     """Each part that is better explained as two, with the motions so.
 
-    reach: how far the two amounts may be from the one (internal units at the part's rim; 0: nothing is tried). Only what the photographs
-    like better as it is, before any refinement, comes back.
+    reach: how far the two amounts may be from the one (internal units at the part's rim; 0: nothing is tried).  least: share of the part's
+    residual that this must save.
     """
     if reach <= 0 or not len(motions):
         return []
-    shifts = [-reach * x for x in SHIFTS[:0:-1]] + [reach * x for x in SHIFTS]
-    options = {"level": level, "backend": backend, "device": device}
-    costs = amount_costs(states, motions, views, shifts, **options)
-    cost = explanation_cost(states, motions, views, **options)
-    found = [(k, split_part(states, motions, k, costs, shifts)) for k in range(len(motions))]
-    return [(k, two) for k, two in found if two is not None and explanation_cost(states, two, views, **options) < cost]
+    shifts = torch.linspace(-reach, reach, STEPS).tolist()
+    costs = amount_costs(states, motions, views, shifts, level=level, backend=backend, device=device)
+    found = ((k, split_part(states, motions, k, costs, shifts)) for k in range(len(motions)))
+    return [(k, f[1]) for k, f in found if f is not None and f[0] >= least]

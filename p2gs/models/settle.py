@@ -53,12 +53,10 @@ def reconsider(
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``); with each every surfel chooses its
     part anew and the states are re-rendered. A part may also be two of nearly one motion (``splits``), as it is or with a doubtful part
     left out: what moved by another amount than its neighbour is easily explained by a wild motion. The best of each kind is refined; the
-    image loss must fall by ``freedom_penalty`` for an exchange, by ``missing_penalty`` for a further part, and for a split by the
-    ``merge_penalty`` that keeps its halves from being made one again. Junk lowers the loss by as much as a small door does: with labels
-    chosen anew, a further part's surface must also be found in both states (discovery's confidence at least ``missing_confidence``) and
-    the photographs must hold its joint, or both halves', where it is (``JointEvidence.confidence`` at least ``missing_evidence``).
-
-    Returns the motions and what was tried.
+    image loss must fall by ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part. Junk lowers the loss by as
+    much as a small door does: with labels chosen anew, a further part's surface must also be found in both states (discovery's confidence
+    at least ``missing_confidence``) and the photographs must hold its joint where it is (``JointEvidence.confidence`` at least
+    ``missing_evidence``).  Returns the motions and what was tried.
     """
     options = {"backend": backend, "device": device}
     level, log = config.coarse.levels[-1], []
@@ -72,9 +70,7 @@ def reconsider(
         tries["exchanged for a split"] = _split_without(found, states, motions, views, config, stacks, options)
         if len(motions) < limit:
             tries["added"] = [(len(motions), m) for m in _with_part(found, states, motions, None)]
-            tries["split"] = splits(states, motions, views, config.split_reach, level=level, **options)
-        penalties = {"exchanged": config.freedom_penalty, "exchanged for a split": config.freedom_penalty}
-        penalties |= {"added": config.missing_penalty, "split": config.merge_penalty}
+            tries["split"] = splits(states, motions, views, config.split_reach, config.split, level=level, **options)
         best = None
         for change, proposed in tries.items():
             if not proposed:
@@ -91,9 +87,9 @@ def reconsider(
                 reached, refined = min((reached, refined), (cost_of(anew), anew), key=lambda t: t[0])
             entry = {"change": change, "part": part, "type": tried.types[part], "before": cost, "tried": min(costs), "after": reached}
             log.append(entry)
-            rank = reached / (1 - penalties[change])
+            rank = reached / (1 - (config.missing_penalty if further else config.freedom_penalty))
             if further and rank < cost:
-                own = refined if change == "split" else _relabelled(found, states, refined)
+                own = _relabelled(found, states, refined)
                 size = min(measuring_level(views[s]) for s in (0, 1))
                 evidence = measure_joints(states, own.labels, own.transforms, own.types, views, stacks, level=size, **options)
                 new = {part, len(motions)}
@@ -126,7 +122,7 @@ def _split_without(found: Discovery, states, motions: PartMotions, views, config
     for k in range(len(motions)):
         if evidence[k].confidence < config.doubtful:
             rest = _relabelled(found, states, without_part(motions, k, 0))
-            out += splits(states, rest, views, config.split_reach, level=level, **options)
+            out += splits(states, rest, views, config.split_reach, config.split, level=level, **options)
     return out
 
 

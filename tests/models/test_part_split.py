@@ -32,7 +32,7 @@ def two_halves(kind: str, apart: float):
 @pytest.mark.parametrize("kind", ["prismatic", "revolute"])
 def test_two_parts_that_were_taken_for_one_are_told_apart(kind):
     states, one, views, labels = two_halves(kind, 0.06)
-    found = splits(states, one, views, 0.05, **OPTIONS)
+    found = splits(states, one, views, 0.05, 0.12, **OPTIONS)
     assert [part for part, _ in found] == [0]
     two = found[0][1]
     assert two.types == [kind] * 2 and len(two.confidence) == 2
@@ -46,8 +46,8 @@ def test_two_parts_that_were_taken_for_one_are_told_apart(kind):
 
 def test_one_part_stays_one():
     states, one, views, _ = two_halves("prismatic", 0.0)
-    assert splits(states, one, views, 0.05, **OPTIONS) == []
-    assert splits(states, one, views, 0.0, **OPTIONS) == []
+    assert splits(states, one, views, 0.05, 0.12, **OPTIONS) == []
+    assert splits(states, one, views, 0.0, 0.12, **OPTIONS) == []
 
 
 def test_residuals_are_those_of_the_pixels_a_gaussian_shows_in():
