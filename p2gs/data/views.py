@@ -116,6 +116,10 @@ class TrainingViews:
             (view.state, view.split, view.name, width, height, x, y, w, h),
         )
 
+    def spread(self, count: int) -> list[int]:
+        """Indices of ``count`` views, evenly from the first to the last (of one: the first); of all views where there are no more."""
+        return torch.linspace(0, len(self) - 1, min(count, len(self))).round().long().tolist()
+
     def camera(self, index: int, level: int) -> Camera:
         """The cropped, scaled camera of a view without its pixels."""
         return self._stored[index][level].camera

@@ -71,7 +71,7 @@ def chosen_shot(states, record: FinishRecord, views: dict[int, TrainingViews], s
     mine = views[s]
     coarse, fine = min(range(len(mine.levels)), key=mine.levels.__getitem__), max(range(len(mine.levels)), key=mine.levels.__getitem__)
     moving, parts = record.labels[s] > 0, len(record.after)
-    picked = torch.linspace(0, len(mine) - 1, min(looks, len(mine))).round().long().tolist()
+    picked = mine.spread(looks)
     best, index = -1.0, picked[0]
     if bool(moving.any()):
         onehot = torch.nn.functional.one_hot(record.labels[s], parts + 1).float()[:, 1:16].contiguous()

@@ -17,7 +17,7 @@ from p2gs.models.canonical import carry, with_static
 from p2gs.models.discovery.evidence import DepthStack, classify
 from p2gs.models.finish import FinishRecord
 from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
-from p2gs.models.joint_confidence import ON_SURFACE, CrossViews, measure_joints, measuring_level, state_depth
+from p2gs.models.joint_confidence import ON_SURFACE, CrossViews, common_level, measure_joints, measuring_level, state_depth
 from p2gs.models.single_state import render_gaussians
 from p2gs.ops import se3
 from p2gs.types import ArticulatedObject, GaussianTensors
@@ -57,7 +57,7 @@ def diagnose(
     unit = 1.0 / twin.similarity.scale
     render = {"backend": backend, "device": device}
     level = max(n for s in (0, 1) for n in views[s].levels)
-    coarse = min(measuring_level(views[s]) for s in (0, 1))
+    coarse = common_level(views)
     stacks = [state_depth(state, views[s], coarse, count=16, **render) for s, state in enumerate(states)]
     d = {
         "format": FORMAT,
@@ -114,7 +114,7 @@ def reconstruction(g: GaussianTensors, views: TrainingViews, level: int, count: 
     """A state against its own photographs (PSNR over grey, alpha IoU over ``count`` of them) and the share of fog among its Gaussians."""
     grey = torch.full((3,), 0.5)
     squared = pixels = both = either = 0.0
-    picked = torch.linspace(0, len(views) - 1, min(count, len(views))).round().long().tolist()
+    picked = views.spread(count)
     for i in picked:
         shot = views.get(i, views.levels.index(level), grey)
         out = render_gaussians(g.to(device), shot.camera.to(device), grey.to(device), backend=backend)
@@ -226,7 +226,7 @@ def own_loss(posed: list[GaussianTensors], views: dict[int, TrainingViews], rend
     device = render["device"]
     for s, g in enumerate(posed):
         level = views[s].levels.index(measuring_level(views[s]))
-        for i in torch.linspace(0, len(views[s]) - 1, min(count, len(views[s]))).round().long().tolist():
+        for i in views[s].spread(count):
             shot = views[s].get(i, level, grey)
             out = render_gaussians(g.to(device), shot.camera.to(device), grey.to(device), backend=render["backend"])
             error = (out.colour.cpu() - shot.image).abs().mean(-1)

@@ -13,7 +13,7 @@ from p2gs.models.canonical import carry, with_static
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.islands import settle_twin_islands
-from p2gs.models.joint_confidence import JointEvidence, measure_joints, measuring_level, state_depth
+from p2gs.models.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.models.joint_range import extend_ranges
 from p2gs.models.phase import PHASES
 from p2gs.models.refine_motions import leave_false_minima, refine, single_ways
@@ -175,7 +175,7 @@ def finish(
         start = se3.apply(se3.screw_at(transforms[k], -time), learned.gaussians.means[rows].double())
         transforms[k] = constrain(kind, transforms[k], start.mean(0))
     options = {"backend": backend, "device": device}
-    level = min(measuring_level(views[s]) for s in (0, 1))
+    level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
     fuller, T = round(time), with_static(transforms)  # the state that shows more
     posed = carry(learned.gaussians, labels, se3.screw_at(T, fuller - time))

@@ -92,12 +92,17 @@ def measuring_level(views: TrainingViews, size: int = 200) -> int:
     return max((n for n in views.levels if n <= size), default=min(views.levels))
 
 
+def common_level(views: dict[int, TrainingViews]) -> int:
+    """The smaller ``measuring_level`` of both states' photographs, by state: both measured alike."""
+    return min(measuring_level(views[s]) for s in (0, 1))
+
+
 def state_depth(
     state: StateGaussians, views: TrainingViews, level: int, count: int = 24, backend: str = "auto", device="cpu"
 ) -> DepthStack:
     """Rendered depth of a state in ``count`` of its views, a quarter wider on each side than the photographs' crops."""
     cameras = []
-    for i in torch.linspace(0, len(views) - 1, min(count, len(views))).round().long().tolist():
+    for i in views.spread(count):
         camera = views.camera(i, views.levels.index(level))
         x, y = camera.width // 4, camera.height // 4
         cameras.append(camera.cropped(-x, -y, camera.width + 2 * x, camera.height + 2 * y))
@@ -144,7 +149,7 @@ class CrossViews:
         self.body = MovedGaussians(state.gaussians, torch.where(solid, labels, -1), device)
         self.transforms, self.backend = transforms.double(), backend
         self.background = torch.full((3,), 0.5)
-        picked = torch.linspace(0, len(views) - 1, min(looks, len(views))).round().long().tolist()
+        picked = views.spread(looks)
         self.shots = [views.get(i, views.levels.index(level), self.background) for i in picked]
         self.shares, self.errors = [], []
         for shot in self.shots:

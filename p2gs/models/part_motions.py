@@ -33,14 +33,15 @@ class PartMotionsConfig:
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
     freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: the same for a further part.
     same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one
-    unless the image loss rises by more than this share.  survey: shifts within its own surface tried for each part (internal units;
-    [] = none).  islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
-    surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.  reconsider: each part's motion, and
-    one more, is searched again amid the others, refined; missing_penalty: relative image loss by which a part that comes so must win;
-    missing_confidence, missing_evidence: confidence and evidence that it must have (``reconsider``).  split_reach: a part is tried as two
-    whose motions differ by up to twice this (internal units; 0 = never) where that saves ``split`` of its residual; also with a part left
-    out whose evidence is below ``doubtful``.  min_confidence: a part of less
-    confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
+    unless the image loss rises by more than this share.
+    survey: shifts within its own surface tried for each part (internal units; [] = none).
+    islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
+    (0 = off).  rounds: how often labels, types and motions are settled anew.
+    reconsider: each part's motion, and one more, is searched again amid the others, refined; missing_penalty: relative image loss by
+    which a part that comes so must win; missing_confidence, missing_evidence: confidence and evidence that it must have.
+    split_reach: a part is tried as two whose motions differ by up to twice this (internal units; 0 = never) where that saves ``split``
+    of its residual; also with a part left out whose evidence is below ``doubtful``.
+    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
 
     evidence_size: int = 200
@@ -89,6 +90,7 @@ def find_part_motions(
 ) -> PartMotions:
     """Parts, motions and labels of every Gaussian of both states, from the reconstructions and the images alone."""
     say = report or (lambda text: None)
+    options = {"seed": seed, "backend": backend, "device": device}
     say("rendering depth of both states")
     evidence = [
         gather_evidence(s.gaussians, scene.select(state=s.state, split="train"), config.evidence_size, config.min_opacity, backend, device)
@@ -107,9 +109,8 @@ def find_part_motions(
         quick = replace(config.coarse, steps=config.look_steps, levels=config.coarse.levels[:1], level_starts=[0.0])
 
         def first_look(explanation) -> float:
-            motions = refine(states, _label_states(explanation, states), views, quick, stacks, seed=seed, backend=backend, device=device)
-            cost = explanation_cost(states, motions, views, quick.levels[0], backend, device)
-            return cost * (1 + config.part_penalty) ** len(motions)
+            motions = refine(states, _label_states(explanation, states), views, quick, stacks, **options)
+            return _rank(explanation_cost(states, motions, views, quick.levels[0], backend, device), motions, config)
 
         looks = [first_look(e) for e in explanations]
         order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
@@ -119,18 +120,16 @@ def find_part_motions(
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
             say(f"re-rendering explanation {number + 1} of {len(explanations)}")
-        motions = refine(states, motions, views, config.coarse, stacks, seed=seed, backend=backend, device=device)
+        motions = refine(states, motions, views, config.coarse, stacks, **options)
         reductions: list[dict] = []
         motions = simplify(states, motions, views, config, backend=backend, device=device, log=reductions)
         cost = explanation_cost(states, motions, views, level, backend, device)
         costs.append(cost)
-        rank = cost * (1 + config.part_penalty) ** len(motions)
+        rank = _rank(cost, motions, config)
         tried.append({"types": motions.types, "cost": cost, "rank": rank, "reductions": reductions})
         if best is None or rank < best[0]:
             best = (rank, motions, number)
-    motions = best[1]
-    motions = settle_types(states, motions, views, config, stacks, seed=seed, backend=backend, device=device)
-    options = {"seed": seed, "backend": backend, "device": device}
+    motions = settle_types(states, best[1], views, config, stacks, **options)
     changed: list[dict] = []
     motions, shifted = leave_false_minima(states, motions, views, config.coarse, stacks, config.survey, **options)
     if config.reconsider:
@@ -159,6 +158,11 @@ def find_part_motions(
     return motions
 
 
+def _rank(cost: float, motions: PartMotions, config: PartMotionsConfig) -> float:
+    """Image loss with a price on every part: lower is better."""
+    return cost * (1 + config.part_penalty) ** len(motions)
+
+
 def _explanations(found) -> list:
     """The chosen explanation first, then the alternatives that differ from it."""
 
@@ -169,6 +173,7 @@ def _explanations(found) -> list:
 
 
 def _label_states(explanation, states: list[StateGaussians]) -> PartMotions:
+    """An explanation's motions with the label of every Gaussian."""
     labels, margin = label_gaussians(explanation, states)
     types = [m.type for m in explanation.motions]
     transforms = (

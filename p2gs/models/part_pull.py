@@ -8,7 +8,7 @@ from torch import Tensor
 from p2gs.native import native
 from p2gs.ops.carry import Parts
 
-Limit = tuple[Tensor, Tensor, Tensor, float]
+Limit = tuple[Tensor, Tensor, Tensor, float]  # seen_from, rotations, eye, least cosine (``part_pulls``)
 
 
 def part_pulls(means: Tensor, quats: Tensor, parts: Parts, centres: Tensor, limit: Limit | None = None) -> Tensor:

@@ -55,7 +55,7 @@ def residuals_by_gaussian(
     features = torch.zeros(len(means), 2, device=body.device, requires_grad=True)
     background = torch.full((3,), 0.5)
     total = torch.zeros(len(means), 2, device=body.device)
-    for index in torch.linspace(0, len(views) - 1, min(count, len(views))).round().long().tolist():
+    for index in views.spread(count):
         shot = views.get(index, views.levels.index(level), background)
         out = body.render(means, quats, sh, shot.camera, background, backend, features=features)
         off = (out.colour.detach() - shot.image.to(body.device)).abs().mean(-1)
@@ -79,7 +79,10 @@ def amount_costs(
     device="cpu",
 ) -> list[tuple[Tensor, Tensor]]:
     """Per state residuals [N, S] of its solid Gaussians in the other state's photographs with every part's motion ``shifts`` [S] longer
-    (internal units at the part's rim), and how much each shows [N, S]."""
+    (internal units at the part's rim), and how much each shows [N, S].
+
+    views: photographs by state, ``count`` of which are looked at in size ``level``.  min_opacity: fainter ones are not solid (0 in both).
+    """
     arms = [rim(states, motions, k) for k in range(len(motions))]
     out = []
     for s in (0, 1):
@@ -111,11 +114,11 @@ def rim(states, motions: PartMotions, part: int) -> float:
 
 
 def split_part(
-    states, motions: PartMotions, part: int, costs: list[tuple[Tensor, Tensor]], shifts: list[float], apart: int = 1
+    states, motions: PartMotions, part: int, costs: list[tuple[Tensor, Tensor]], shifts: list[float]
 ) -> tuple[float, PartMotions] | None:
     """The part as two by the best pair of amounts, and the share of its residual that this saves against the best single amount.
 
-    costs: of ``amount_costs``.  apart: least difference of the amounts, in steps.  None where a half would have next to nothing in a state.
+    costs: of ``amount_costs``.  None where a half would have next to nothing in a state.
     """
     rows = [((motions.labels[s] == part + 1) & (costs[s][1].amax(1) > 0)).nonzero().squeeze(1) for s in (0, 1)]
     if min(map(len, rows)) < 2 * FEWEST:
@@ -136,8 +139,7 @@ def split_part(
     w = (weight / weight.sum())[:, 0]
     single = (w @ cost).min()
     pairs = torch.stack([w @ torch.minimum(cost, cost[:, i : i + 1]) for i in range(len(shifts))])
-    near = (torch.arange(len(shifts))[:, None] - torch.arange(len(shifts))).abs() < apart
-    a, b = divmod(int(torch.where(near, torch.inf, pairs).argmin()), len(shifts))
+    a, b = divmod(int(pairs.fill_diagonal_(torch.inf).argmin()), len(shifts))  # two different amounts
     scale = float((w * (cost[:, a] - cost[:, b]).abs()).sum().clamp_min(1e-6))
     second = smooth_labels(cost[:, [a, b]] / (3 * scale), graph).argmax(1) == 1
     halves = second.split([len(r) for r in rows])

@@ -45,6 +45,7 @@ class PolishConfig:
     front: float = 0.2
 
     def level(self, fraction: float) -> int:
+        """Image size when this share of the steps is done."""
         return [size for size, start in zip(self.levels, self.level_starts, strict=False) if fraction >= start][-1]
 
 
@@ -65,6 +66,7 @@ class MovedGaussians:
         self.bodies = Parts(self.labels)
 
     def rows(self, part: int) -> Tensor:
+        """Indices of a part's Gaussians among those that were not left out."""
         return (self.labels == part).nonzero().squeeze(1)
 
     def moved(self, transforms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -72,6 +74,7 @@ class MovedGaussians:
         return carry(self.g.means, self.quats, self.g.sh, self.bodies, transforms)
 
     def render(self, means: Tensor, quats: Tensor, sh: Tensor, camera: Camera, background: Tensor, backend: str, features=None):
+        """A view of what ``moved`` gives, or of the like; features [N, F] as in ``rasterize``."""
         camera, background = camera.to(self.device), background.to(self.device)
         return rasterize(
             means,
@@ -235,7 +238,7 @@ def photometric_cost(
     """Mean image loss of the moved Gaussians over ``count`` views spread over the training set: lower explains the images better."""
     body = MovedGaussians(gaussians, labels, device)
     means, quats, sh = body.moved(transforms)
-    total, picked = 0.0, torch.linspace(0, len(views) - 1, min(count, len(views))).round().long().tolist()
+    total, picked = 0.0, views.spread(count)
     for index in picked:
         background = torch.full((3,), 0.5)
         shot = views.get(index, views.levels.index(level), background)

@@ -12,7 +12,7 @@ from p2gs.models.discovery import Candidate, Discovery, instead_of, relabel
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.islands import settle_islands
-from p2gs.models.joint_confidence import measure_joints, measuring_level
+from p2gs.models.joint_confidence import JointEvidence, common_level, measure_joints
 from p2gs.models.part_choices import settle_types, without_part
 from p2gs.models.part_split import splits
 from p2gs.models.refine_motions import explanation_cost, refine
@@ -77,21 +77,20 @@ def reconsider(
                 continue
             costs = [cost_of(m) for _, m in proposed]
             part, tried = proposed[costs.index(min(costs))]
+            entry = {"change": change, "part": part, "type": tried.types[part], "before": cost, "tried": min(costs), "after": None}
+            log.append(entry)
             if min(costs) > cost * (1 + HOPELESS):
-                log.append({"change": change, "part": part, "type": tried.types[part], "before": cost, "tried": min(costs), "after": None})
                 continue
             refined = refine(states, tried, views, config.coarse, stacks, seed=seed, **options)
             reached, further = cost_of(refined), len(refined) > len(motions)
             if "split" in change:  # where the halves meet, geometry may know better once their motions are known
                 anew = refine(states, _relabelled(found, states, refined), views, config.coarse, stacks, seed=seed, **options)
                 reached, refined = min((reached, refined), (cost_of(anew), anew), key=lambda t: t[0])
-            entry = {"change": change, "part": part, "type": tried.types[part], "before": cost, "tried": min(costs), "after": reached}
-            log.append(entry)
+            entry["after"] = reached
             rank = reached / (1 - (config.missing_penalty if further else config.freedom_penalty))
             if further and rank < cost:
                 own = _relabelled(found, states, refined)
-                size = min(measuring_level(views[s]) for s in (0, 1))
-                evidence = measure_joints(states, own.labels, own.transforms, own.types, views, stacks, level=size, **options)
+                evidence = _evidence(states, own, views, stacks, options)
                 new = {part, len(motions)}
                 entry |= {"confidence": min(float(own.confidence[k]) for k in new), "evidence": min(evidence[k].confidence for k in new)}
                 if entry["confidence"] < config.missing_confidence or entry["evidence"] < config.missing_evidence:
@@ -117,13 +116,18 @@ def _split_without(found: Discovery, states, motions: PartMotions, views, config
     level, out = config.coarse.levels[-1], []
     if config.split_reach <= 0:
         return out
-    size = min(measuring_level(views[s]) for s in (0, 1))
-    evidence = measure_joints(states, motions.labels, motions.transforms, motions.types, views, stacks, level=size, **options)
+    evidence = _evidence(states, motions, views, stacks, options)
     for k in range(len(motions)):
         if evidence[k].confidence < config.doubtful:
             rest = _relabelled(found, states, without_part(motions, k, 0))
             out += splits(states, rest, views, config.split_reach, config.split, level=level, **options)
     return out
+
+
+def _evidence(states, motions: PartMotions, views, stacks: list[DepthStack], options: dict) -> list[JointEvidence]:
+    """What both states show of each joint (``measure_joints``)."""
+    level = common_level(views)
+    return measure_joints(states, motions.labels, motions.transforms, motions.types, views, stacks, level=level, **options)
 
 
 def _relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:

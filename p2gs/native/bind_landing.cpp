@@ -1,9 +1,7 @@
-#include <nanobind/stl/array.h>
-
 #include <algorithm>
 #include <array>
 
-#include "bind.h"
+#include "bind_motions.h"
 #include "landing.h"
 
 namespace p2gs {
@@ -12,7 +10,6 @@ namespace {
 using Tables = std::array<Address, 3>;
 using Figures = std::array<float, 9>;
 using Sizes = std::array<int32_t, 6>;
-using Motions = std::array<Address, 4>;
 
 LandingTables tables(const Tables& at, const Figures& f, const Sizes& sizes, Address claimed) {
     LandingTables t{pointer<const int32_t>(at[0]), pointer<const float>(at[1]), pointer<const float>(at[2]), pointer<const float>(claimed),
@@ -20,10 +17,6 @@ LandingTables tables(const Tables& at, const Figures& f, const Sizes& sizes, Add
     std::copy_n(sizes.begin(), 3, t.fine);
     std::copy_n(sizes.begin() + 3, 3, t.coarse);
     return t;
-}
-
-MotionBatch batch(const Motions& at, int64_t count) {
-    return {pointer<const uint8_t>(at[0]), pointer<const float>(at[1]), pointer<const float>(at[2]), pointer<const float>(at[3]), count};
 }
 
 }  // namespace

@@ -1,20 +1,6 @@
-#include <nanobind/stl/array.h>
-
-#include <array>
-
-#include "bind.h"
-#include "motions.h"
+#include "bind_motions.h"
 
 namespace p2gs {
-namespace {
-
-using Motions = std::array<Address, 4>;
-
-MotionBatch batch(const Motions& at, int64_t count) {
-    return {pointer<const uint8_t>(at[0]), pointer<const float>(at[1]), pointer<const float>(at[2]), pointer<const float>(at[3]), count};
-}
-
-}  // namespace
 
 void bind_motions(nb::module_& m) {
     m.def(

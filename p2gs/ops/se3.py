@@ -31,7 +31,7 @@ class Screw(NamedTuple):
 
 def make(R: Tensor, t: Tensor) -> Tensor:
     """R [..., 3, 3], t [..., 3] -> [..., 4, 4]; batch shapes broadcast."""
-    batch = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+    batch = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])  # torch's own imports sympy, which takes a second
     top = torch.cat([R.expand(*batch, 3, 3), t.expand(*batch, 3)[..., None]], -1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*batch, 1, 4)
     return torch.cat([top, bottom], -2)

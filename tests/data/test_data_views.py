@@ -179,6 +179,18 @@ def test_get_is_deterministic_and_keys_tell_crops_apart():
     assert torch.equal(views.get(0, 2, background).image, b.image), "a level above the photograph's size holds it at its own size"
 
 
+@given(n=st.integers(0, 40), count=st.integers(1, 50))
+@settings(max_examples=60, deadline=None)
+def test_spread_goes_evenly_from_the_first_view_to_the_last(n, count):
+    views = TrainingViews([])
+    views._stored = [None] * n
+    picked = views.spread(count)
+    assert len(picked) == min(n, count) and picked == sorted(set(picked))
+    if n:
+        assert picked[0] == 0 and (count == 1 or picked[-1] == n - 1)
+    assert len(picked) < 2 or np.ptp(np.diff(picked)) <= 1
+
+
 def test_mask_bounds_and_farthest_cameras():
     alpha = torch.zeros(10, 12, dtype=torch.uint8)
     assert mask_bounds(alpha) == (0, 0, 12, 10)

@@ -112,7 +112,8 @@ def test_every_candidate_is_complete(door_and_drawer):
     assert scores[0] == min(scores) == found.score
     for c in found.candidates:
         assert int(c.labels_start.max()) <= len(c.motions) and len(c.labels_end) == len(views[1].points)
-    assert {"tau", "noise", "states", "search", "seconds", "candidates"} <= set(found.diagnostics)
+    assert {"tau", "noise", "states", "axes", "search", "seconds", "candidates"} <= set(found.diagnostics)
+    assert len(found.diagnostics["search"]) == SMALL.searches and all(s["motions_tried"] > 0 for s in found.diagnostics["search"])
 
 
 def test_double_doors_are_not_swapped():

@@ -87,13 +87,13 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
 
 
 def split_amounts(
-    problem: Problem, labelling: Labelling, graphs: list[Graph], motions: Motions, k: int, apart: float = 0.9, steps: int = 25
-):
+    problem: Problem, labelling: Labelling, graphs: list[Graph], motions: Motions, k: int, steps: int = 25
+) -> tuple[float, float, float]:
     """Do two amounts about one axis explain part k better than one?  (evidence, amount a, amount b).
 
     Costs of every moved point over amounts within four tolerances, averaged over neighbours. Of the best pair, the evidence is what
     the smaller half saves against the best single amount, relative to its cost, in the state where it saves less; nothing when the
-    amounts differ by less than ``apart`` tolerances: that is what noise does to one part.
+    amounts differ by less than 0.9 tolerances: that is what noise does to one part.
     """
     m = motions[k : k + 1]
     tp = problem.scale.tp
@@ -116,7 +116,7 @@ def split_amounts(
         costs.append(full[index])
     single = sum(c.mean(0) for c in costs)
     pair = sum(torch.minimum(c[:, :, None], c[:, None, :]).mean(0) for c in costs)
-    far = (delta[:, None] - delta[None]).abs() * arm >= apart * tp
+    far = (delta[:, None] - delta[None]).abs() * arm >= 0.9 * tp
     pair = torch.where(far, pair, torch.full_like(pair, 9.0))
     a, b = divmod(int(pair.argmin()), steps)
     best = int(single.argmin())

@@ -62,7 +62,9 @@ def discover(
         axes, still = directions(problem), static_axes(problem)
         most = max(limit, config.max_parts - 1)  # a bound cuts what is found, not the search
         sets: list[tuple[float, Motions]] = []
-        for number in range(max(config.searches, 1)):
+        searches = max(config.searches, 1)
+        figures |= {"axes": axes.tolist(), "search": []}
+        for number in range(searches):
             looked = problem if number == 0 else resampled(problem, seed + number)
             swept = sweep(looked, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in looked.samples])
             one = Search(looked, swept, most, config.part_cost)
@@ -71,10 +73,8 @@ def discover(
             solutions += one.alternatives(solutions)
             found = [(value, one.pool.motions[torch.tensor(chosen)]) for value, chosen in solutions if value > 0 and chosen]
             sets += [f for f in found[: config.candidates] if not any(search.agree(f[1], other) for _, other in sets)]
-            tell("selection", 0.2 + 0.5 * (number + 1) / config.searches)
-            figures.setdefault("search", []).append(
-                {"axes": axes.tolist(), "motions_tried": len(swept.motions), **one.trace[-1]} if one.trace else {}
-            )
+            tell("selection", 0.2 + 0.5 * (number + 1) / searches)
+            figures["search"].append({"motions_tried": len(swept.motions), **one.trace[-1]} if one.trace else {})
         lap("selection", 0.7)
         explanations = [finish(problem, graphs, motions, value, most, limit, still) for value, motions in sets]
         explanations += again(problem, graphs, search, explanations, limit, still)

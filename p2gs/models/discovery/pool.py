@@ -176,21 +176,23 @@ class Pool:
         if not len(chosen):
             return 0.0
         rows = torch.tensor(list(chosen))
-        share = []
-        for s, e in enumerate(self.effective(rows, self.best(chosen))):
-            if native is not None:
-                e, w, out = e.contiguous(), self.problem.weights[s].contiguous(), torch.empty(2, len(rows))
-                native.evidence_shares(
-                    e.data_ptr(), w.data_ptr(), self.loose[s].data_ptr(), rows.data_ptr(), *e.shape, out.data_ptr()
-                )  # fmt: skip
-                share.append((out[0], out[1]))
-                continue
-            value, who = e.max(0)
-            value = value * self.problem.weights[s]
-            loose = self.loose[s][rows].gather(0, who[None])[0]
-            zero = torch.zeros(len(chosen))
-            share.append((zero.index_add(0, who, value * ~loose), zero.index_add(0, who, value * loose)))
-        return float(balanced(*share).sum()) / 2
+        shares = self.shares_reference if native is None else self.shares
+        return float(balanced(*(shares(s, e, rows) for s, e in enumerate(self.effective(rows, self.best(chosen))))).sum()) / 2
+
+    def shares(self, state: int, e: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """``shares_reference`` in one pass of a kernel."""
+        e, w, out = e.contiguous(), self.problem.weights[state].contiguous(), torch.empty(2, len(rows))
+        native.evidence_shares(e.data_ptr(), w.data_ptr(), self.loose[state].data_ptr(), rows.data_ptr(), *e.shape, out.data_ptr())
+        return out[0], out[1]
+
+    def shares_reference(self, state: int, e: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Weighted evidence [R] of a state's points that motions ``rows`` get, each the points that it pays most for of e [R, P]: of points
+        that land on a moved surface or a static one, and of those that land on one of unknown fate or none (``loose``)."""
+        value, who = e.max(0)
+        value = value * self.problem.weights[state]
+        loose = self.loose[state][rows].gather(0, who[None])[0]
+        zero = torch.zeros(len(rows))
+        return zero.index_add(0, who, value * ~loose), zero.index_add(0, who, value * loose)
 
     def mean(self, e: list[Tensor]) -> Tensor:
         """Weighted mean [B] over both states of evidence [B, P0], [B, P1]."""

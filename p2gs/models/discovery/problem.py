@@ -39,9 +39,6 @@ class Problem:
     centre: Tensor
     replaced: list[Tensor]
 
-    def points(self, state: int) -> Tensor:
-        return self.surfels[state].points[self.samples[state]]
-
     def cost(self, motions: Motions, state: int, index: Tensor, claimed: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Landing cost [B, P] of surfels ``index`` of ``state`` under each motion (start by T, end by T^-1), and what they meet."""
         return self.landings[1 - state].arrive(motions, self.landings[state], index, state == 1, claimed)
@@ -176,7 +173,7 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
 
 
 def resampled(problem: Problem, seed: int) -> Problem:
-    """The problem with other moved surfels to look at."""
+    """The problem with moved surfels drawn anew to look at (``samples``) and their weights."""
     g = torch.Generator().manual_seed(seed)
     samples, weights = [], []
     for s in (0, 1):

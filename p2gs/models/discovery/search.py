@@ -193,6 +193,7 @@ class Search:
         return out
 
     def same(self, a: list[int], b: list[int]) -> bool:
+        """``agree`` for two sets of the pool's hypotheses."""
         m = self.pool.motions
         return self.agree(m[torch.tensor(a, dtype=torch.long)], m[torch.tensor(b, dtype=torch.long)])
 

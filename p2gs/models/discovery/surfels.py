@@ -33,8 +33,9 @@ class Surfels:
 def window_planes(stack: DepthStack, view: Tensor, y: Tensor, x: Tensor, reach: float, radius: int = 2, block: int = 8192):
     """Plane through the (2r+1)^2 pixels about each given pixel, pixels farther than ``reach`` in depth faded out.
 
-    Returns point [M, 3] (the pixel's ray cut with the plane's mean depth), normal [M, 3] towards the camera, support [M] (pixels), all
-    in world coordinates. Solved as a weighted regression of inverse depth, which is exact for a plane seen in perspective.
+    Returns point [M, 3] (the pixel's ray cut with the plane's mean depth) and normal [M, 3] towards the camera, both in world coordinates,
+    support [M] (pixels) and cosine [M] between normal and ray. Solved as a weighted regression of inverse depth, which is exact for a
+    plane seen in perspective.
     block: pixels at a time, so that what lies between stays in the caches.
     """
     if len(view) > block:
