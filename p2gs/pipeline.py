@@ -30,6 +30,7 @@ from p2gs.models.part_motions import find_part_motions
 from p2gs.models.phase import Phase
 from p2gs.models.single_state import SingleStatePhase
 from p2gs.native import keep_memory
+from p2gs.side_stage import SideStage, can_run_beside
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError
 
 STAGES = ("single_state", "discovery", "canonical_fusion", "articulation", "finish")
@@ -58,7 +59,7 @@ class Pipeline:
         self.init = cfg.phases["articulation"].config.init
         if self.init != "discovery" and cfg.num_parts == "auto":
             raise UserError(f"num_parts: auto needs phases.articulation.init: discovery (it is '{self.init}'); give --num_parts N")
-        self._views: Optional[dict[int, TrainingViews]] = None
+        self._views: dict[int, TrainingViews] = {}
         self.times: dict[str, dict] = {}
 
     # -- what stages share ----------------------------------------------------------------------------------------------------
@@ -68,18 +69,17 @@ class Pipeline:
 
     @property
     def views(self) -> dict[int, TrainingViews]:
-        """Training views of both states, at every size a stage asks for; made once."""
-        if self._views is None:
-            sizes: set[int] = set()
-            for name in STAGES:
-                sizes |= _levels(self.cfg.phases[name].config)
-            self._views = {}
-            for state in (0, 1):
-                views = self.scene.select(state=state, split="train")
-                if not views:
-                    raise UserError(f"{self.scene.name}: there are no training views of state {state}; expected photographs of both states")
-                self._views[state] = TrainingViews(views, sorted(sizes))
-        return self._views
+        """Training views of both states."""
+        return {state: self.views_of(state) for state in (0, 1)}
+
+    def views_of(self, state: int) -> TrainingViews:
+        """Training views of a state, at every size a stage asks for; made once."""
+        if state not in self._views:
+            views = self.scene.select(state=state, split="train")
+            if not views:
+                raise UserError(f"{self.scene.name}: there are no training views of state {state}; expected photographs of both states")
+            self._views[state] = TrainingViews(views, sorted(set().union(*(_levels(self.cfg.phases[name].config) for name in STAGES))))
+        return self._views[state]
 
     def key(self, stage: str) -> str:
         """Hash of all that decides a stage's result."""
@@ -118,9 +118,7 @@ class Pipeline:
     def run(self, only: Optional[str] = None) -> Path:
         self.run_dir.mkdir(parents=True, exist_ok=True)
         save_config(self.cfg, self.run_dir / "config.yaml")
-        states = [
-            self.stage(f"single_state_{s}", only, partial(self.train, f"single_state_{s}", partial(self.single_state, s))) for s in (0, 1)
-        ]
+        states = self.single_states(only)
         if only == "single_state":
             return self.run_dir
         motions = self.stage("discovery", only, lambda: self.discover(states)) if self.init == "discovery" else None
@@ -149,17 +147,21 @@ class Pipeline:
         began = time.perf_counter()
         value = make()
         seconds = time.perf_counter() - began
-        handover.save(value, self.file(name), key=self.key(name))
-        (self.run_dir / "checkpoints" / f"{name}.ckpt").unlink(missing_ok=True)
+        self.keep(name, value)
         self.note_time(name, seconds)
         return value
 
-    def note_time(self, name: str, seconds: float) -> None:
+    def keep(self, name: str, value: Any) -> None:
+        """Save a stage's result; what it would have gone on from is not needed any more."""
+        handover.save(value, self.file(name), key=self.key(name))
+        (self.run_dir / "checkpoints" / f"{name}.ckpt").unlink(missing_ok=True)
+
+    def note_time(self, name: str, seconds: float, whose: int = resource.RUSAGE_SELF) -> None:
         """RUN/logs/stages.json: seconds and peak memory (MiB) of each stage; of a resumed one the last sitting."""
         path = self.run_dir / "logs" / "stages.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         times = json.loads(path.read_text()) if path.exists() else {}
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        peak = resource.getrusage(whose).ru_maxrss // 1024
         times[name] = {"seconds": round(seconds, 2), "peak_memory_mib": peak}
         path.write_text(json.dumps(times, indent=1))
         print(f"{name}: {seconds:.1f} s, peak memory {peak} MiB", flush=True)
@@ -168,8 +170,34 @@ class Pipeline:
     def common(self) -> dict:
         return {"seed": self.cfg.seed, "rasterizer": self.cfg.rasterizer}
 
+    def single_states(self, only: Optional[str]) -> list[handover.StateGaussians]:
+        """Both states, at once where there are threads for it. Each has half of the threads then, also when it is the only one left to
+        do: a run that was interrupted ends as it would have.
+        """
+        names, threads = ["single_state_0", "single_state_1"], torch.get_num_threads()
+        beside = can_run_beside(self.cfg, self.device)
+        torch.set_num_threads(threads // 2 if beside else threads)
+        try:
+            anew = only == "single_state" or (only is None and all(self.done(name) is None for name in names))
+            if not (beside and anew):
+                return [self.stage(name, only, partial(self.train_state, name)) for name in names]
+            with SideStage(self.run_dir, names[1], threads // 2) as other:
+                first = self.stage(names[0], only, partial(self.train_state, names[0]))
+                seconds = other.wait()
+            self.note_time(names[1], seconds, resource.RUSAGE_CHILDREN)
+            return [first, self.done(names[1])]
+        finally:
+            torch.set_num_threads(threads)
+
+    def train_state(self, name: str) -> handover.StateGaussians:
+        return self.train(name, partial(self.single_state, int(name[-1])))
+
+    def train_alone(self, name: str) -> None:
+        """A single state's stage and nothing else, for the process beside a run: the result is kept, the run itself notes its time."""
+        self.keep(name, self.train_state(name))
+
     def single_state(self, state: int, section) -> Phase:
-        return SingleStatePhase(section.config, section.losses, self.scene, state, self.views[state], **self.common())
+        return SingleStatePhase(section.config, section.losses, self.scene, state, self.views_of(state), **self.common())
 
     def discover(self, states) -> handover.PartMotions:
         return find_part_motions(

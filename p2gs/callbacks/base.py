@@ -37,10 +37,11 @@ class Callback(LightningCallback):
     ``.item()`` only when logging), ``num_gaussians``, ``preview(times)`` (name -> uint8 [H, W, 3]), ``summary()`` (name -> float).
 
     changes_result: whether the twin depends on it. A phase runs again when such a callback's options change; callbacks
-    that only watch say False.
+    that only watch say False.  alone: with it only one phase trains at a time (else both single states may, each in a process).
     """
 
     changes_result: ClassVar[bool] = True
+    alone: ClassVar[bool] = False
 
     def prepare(self, cfg, scene) -> None:
         """Before a phase's training. cfg: the run's RunConfig.  scene: the TwoStateScene as trained on (internal units)."""

@@ -18,6 +18,7 @@ class Viewer(Callback):
     """
 
     changes_result = False
+    alone = True  # one server, one port
     every: int = 100
     host: str = "127.0.0.1"
     port: int = 8080
