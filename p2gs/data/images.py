@@ -57,6 +57,38 @@ def downscale_rgba(image: np.ndarray, alpha: np.ndarray, width: int, height: int
     return to_uint8(colour), to_uint8(a[..., 0])
 
 
+def coverage(mask: np.ndarray) -> np.ndarray:
+    """Alpha of a mask file, uint8: any number above 0 is the object, as in DTA, unless most of the object is 255 and its rim lies between.
+
+    Such a mask was drawn with soft edges. Read as "above 0" it grows the object by half a pixel on all sides.
+    """
+    if mask.dtype == np.uint8 and 2 * np.count_nonzero(mask == 255) > np.count_nonzero(mask):
+        return mask.copy()
+    return np.where(mask > 0, 255, 0).astype(np.uint8)
+
+
+def colour_of_rim(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Straight colour [H, W, 3] with the soft edge's pixels that were blacked out filled from their neighbours (two pixels far at most).
+
+    DTA's images are cut out along half of a mask's value: what is below is black, a rim that no object has.
+    """
+    import cv2
+
+    black = ~image.any(axis=2)
+    unknown = black & (alpha > 0) & (alpha < 255)
+    known = (alpha > 0) & ~unknown
+    out = image.copy()
+    for _ in range(2):
+        if not unknown.any():
+            break
+        count = cv2.blur(known.astype(np.float32), (3, 3), borderType=cv2.BORDER_CONSTANT)
+        total = cv2.blur(np.where(known[..., None], out, 0).astype(np.float32), (3, 3), borderType=cv2.BORDER_CONSTANT)
+        found = unknown & (count > 1e-6)
+        out[found] = to_uint8(total[found] / count[found][:, None])
+        known, unknown = known | found, unknown & ~found
+    return out
+
+
 def _decode(path: Path, report: Report) -> Optional[np.ndarray]:
     import cv2
 
@@ -83,7 +115,7 @@ def _read_alpha(frame: Frame, image: np.ndarray, report: Report) -> Optional[np.
         if mask.shape != image.shape[:2]:
             report.error(f"{frame.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, but its image is {image.shape[1]}x{image.shape[0]}")
             return None
-        alpha = np.where(mask > 0, 255, 0).astype(np.uint8)
+        alpha = coverage(mask)
     if not alpha.any():
         report.error(f"{frame.mask or frame.image}: mask is empty, no pixel belongs to the object")
         return None
@@ -135,6 +167,8 @@ def read_view(frame: Frame, report: Report, downscale: float = 1.0, depth: Depth
     if not _check_fit(K, frame, width, height, report) or alpha is None:
         return None
     colour = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels[..., 2::-1]
+    if frame.mask is not None:
+        colour = colour_of_rim(colour, alpha)
     z = None
     if depth != "never" and frame.depth is not None:
         z = _read_depth(frame, (height, width), report)

@@ -172,3 +172,19 @@ def test_masks_that_share_no_object_are_told(copy_of):
         cv2.imwrite(str(path), image)
     with pytest.raises(UserError, match="masks of state 'start' show no common object"):
         DATASETS["artgs"](root=str(root)).scene()
+
+
+def test_a_soft_mask_is_coverage_and_its_black_rim_is_filled(copy_of):
+    """Soft edges are alpha; the half of them that the image blacks out takes the colour beside it."""
+    root = copy_of("dta")
+    path, picture = root / "mask/0_0000.png", root / "color_segmented/0_0000.png"
+    mask, image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED), cv2.imread(str(picture))
+    image[mask > 0] = (10, 60, 200)
+    soft = cv2.blur(mask, (3, 3))
+    cv2.imwrite(str(path), soft)
+    rim = np.where((soft >= 128)[..., None], np.where((mask > 0)[..., None], image, (10, 60, 200)), 0)
+    cv2.imwrite(str(picture), rim.astype(np.uint8))
+    view = {v.name: v for v in read("dta", root).views}["0_0000"]
+    alpha = view.alpha.numpy()
+    assert np.array_equal(alpha, soft) and ((alpha > 0) & (alpha < 128)).sum() > 50
+    assert np.array_equal(np.unique(view.image.numpy()[alpha > 0], axis=0), [[200, 60, 10]])
