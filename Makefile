@@ -47,7 +47,7 @@ sanitize: setup-dev
 	cmake -S . -B build/sanitize -DP2GS_SANITIZE=ON -DCMAKE_BUILD_TYPE=None -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python >/dev/null
 	cmake --build build/sanitize -j 2
 	LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
-	P2GS_NATIVE_FILE=$$(ls $(CURDIR)/build/sanitize/_native*) $(BIN)/python -m pytest --timeout=600 tests/native tests/render tests/ops/test_assign.py tests/ops/test_blend.py tests/ops/test_pixels.py tests/ops/test_repel.py tests/models/test_part_pull.py
+	P2GS_NATIVE_FILE=$$(ls $(CURDIR)/build/sanitize/_native*) $(BIN)/python -m pytest --timeout=600 tests/native tests/render tests/ops/test_assign.py tests/ops/test_blend.py tests/ops/test_pixels.py tests/ops/test_planar.py tests/ops/test_repel.py tests/models/test_part_pull.py
 
 clean:
 	rm -rf .venv build dist wheelhouse runs .pytest_cache .ruff_cache .hypothesis

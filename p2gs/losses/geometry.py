@@ -7,6 +7,7 @@ from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs, register_loss
 from p2gs.ops.pixels import depth_spread
+from p2gs.ops.planar import hidden_bends
 
 
 @register_loss("depth")
@@ -65,22 +66,6 @@ class Planar(Loss):
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
         render, target = inputs.render, inputs.target
-        if render is None or target is None or render.expected_depth is None:
+        if render is None or target is None:
             return None
-        inside = (target.alpha > 0.9) & (render.alpha.detach() > 0.5)
-        depth = torch.where(inside, render.expected_depth, torch.ones_like(render.expected_depth)).clamp_min(1e-3)
-        total, count = depth.new_zeros(()), 0
-        for image, d, mask in ((target.image, depth, inside), (target.image.transpose(0, 1), depth.T, inside.T)):
-            step = ((image[1:] - image[:-1]).abs().mean(-1) - self.noise).clamp_min(0)
-            # a step over the outline counts so much that nothing is left of the weight, and no more: sums keep their precision
-            step = torch.where(mask[1:] & mask[:-1], step, torch.full_like(step, 30 * self.contrast))
-            travelled = torch.cat([step.new_zeros(1, step.shape[1]), step.cumsum(0)])
-            inverse = 1 / d
-            for s in self.strides:
-                if len(d) <= 2 * s:
-                    continue
-                bend = inverse[: -2 * s] - 2 * inverse[s:-s] + inverse[2 * s :]
-                w = torch.exp((travelled[: -2 * s] - travelled[2 * s :]) / self.contrast)
-                total = total + (w * bend.abs() * d[s:-s].detach().square()).sum() / w.sum().clamp_min(1)
-                count += 1
-        return total / count if count else None
+        return hidden_bends(target.image, target.alpha, render.depth, render.alpha, self.strides, self.contrast, self.noise)

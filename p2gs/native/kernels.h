@@ -17,6 +17,7 @@
 #include "image.h"
 #include "knn.h"
 #include "landing.h"
+#include "planar.h"
 #include "raster.h"
 #include "repel.h"
 #include "ssim.h"
@@ -40,6 +41,7 @@ struct Kernels {
     AssignKernels assign;
     RepelKernels repel;
     FuseKernels fuse;
+    PlanarKernels planar;
 };
 
 namespace avx512 { extern const Kernels table; }
