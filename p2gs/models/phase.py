@@ -15,6 +15,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.adam import NamedAdam
 from p2gs.models.splats import Splats
+from p2gs.native import serial_torch
 from p2gs.registry import Registry
 from p2gs.types import UserError
 
@@ -146,6 +147,12 @@ class Phase(LightningModule):
         return total
 
     def training_step(self, batch, batch_idx):
+        native_step = self.splats.means.device.type == "cpu" and self.rasterizer in ("auto", "cpu")
+        with serial_torch(native_step):
+            self.one_step()
+
+    def one_step(self) -> None:
+        """Render, losses, backward pass, optimiser."""
         step = self.step
         optimizer = self.optimizers()
         rates = self.learning_rates(step)

@@ -17,6 +17,7 @@ from p2gs.models.adam import NamedAdam
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.single_state import SplatRates, render_gaussians
 from p2gs.models.splats import Splats
+from p2gs.native import serial_torch
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors
 
@@ -59,7 +60,8 @@ def tune(
     rates = config.rates.at(0.0)
     optimizer = NamedAdam([{"params": [getattr(splats, name)], "lr": rate, "name": name} for name, rate in rates.items()], eps=1e-15)
     cache: dict = {}
-    for step in range(config.steps):
+
+    def one_step(step: int) -> None:
         state = step % 2
         rates = config.rates.at(step / config.steps)
         for group in optimizer.param_groups:
@@ -77,4 +79,8 @@ def tune(
         optimizer.zero_grad(set_to_none=True)
         sum(values).backward()
         optimizer.step()
+
+    with serial_torch(splats.means.device.type == "cpu" and backend in ("auto", "cpu")):
+        for step in range(config.steps):
+            one_step(step)
     return splats.tensors().detach().to("cpu").clone()

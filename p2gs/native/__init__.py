@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from typing import Optional
+from contextlib import contextmanager
+from typing import Iterator, Optional
 
 from p2gs.types import UserError
 
@@ -28,11 +29,37 @@ if native is not None:
         raise UserError(f"P2GS_ISA={_wanted} is not among what this machine runs: {', '.join(native.available_isas())}")
 
 
+_kernel_threads: Optional[int] = None  # inside serial_torch: what torch had
+
+
 def num_threads() -> int:
-    """Threads a kernel may use: those of torch (``torch.set_num_threads``, ``OMP_NUM_THREADS``)."""
+    """Threads a kernel may use: those of torch (``torch.set_num_threads``, ``OMP_NUM_THREADS``), inside ``serial_torch`` those it had."""
     import torch
 
-    return torch.get_num_threads()
+    return _kernel_threads or torch.get_num_threads()
+
+
+@contextmanager
+def serial_torch(on: bool = True) -> Iterator[None]:
+    """Inside, torch's own operations stay on one thread and the kernels keep all of them; ``on=False``: nothing changes.
+
+    What a training step leaves to torch are many operations on some ten thousand numbers. Sharing each out wakes a sleeping thread, which
+    takes longer than the work, and the two pools fight for the same cores.
+    """
+    import torch
+
+    global _kernel_threads
+    if not on or native is None or _kernel_threads is not None:
+        yield
+        return
+    before = torch.get_num_threads()
+    _kernel_threads = before
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _kernel_threads = None
 
 
 def keep_memory() -> None:
