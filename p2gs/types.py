@@ -136,6 +136,10 @@ class GaussianTensors:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def placed(self, means: Tensor, quats: Tensor) -> "GaussianTensors":
+        """The same Gaussians elsewhere: other centres [N, 3] and orientations [N, 4]."""
+        return GaussianTensors(means, quats, self.log_scales, self.opacity_logits, self.sh)
+
     def __getitem__(self, index) -> "GaussianTensors":
         return GaussianTensors(*(getattr(self, n)[index] for n in self.NAMES))
 

@@ -81,7 +81,7 @@ class CanonicalFusionPhase(ImagePhase):
         """The Gaussians at state 0 or 1, with gradients."""
         g = self.splats.tensors()
         if hasattr(self.splats, "offsets"):
-            return GaussianTensors(g.means + self.splats.offsets[:, state], g.quats, g.log_scales, g.opacity_logits, g.sh)
+            return g.placed(g.means + self.splats.offsets[:, state], g.quats)
         T = se3.screw_at(with_static(self.transforms), state - (1 - self.betas))
         return carry(g, self.splats.labels, T)
 

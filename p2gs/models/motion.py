@@ -43,4 +43,4 @@ def initial_screws(kind: str, parts: int, generator: torch.Generator) -> Tensor:
 def blend_move(g: GaussianTensors, probs: Tensor, twists: Tensor) -> GaussianTensors:
     """The Gaussians where their soft assignment probs [N, K] puts them under the motions of twists [K-1, 6]; see ``ops.blend``."""
     means, quats = blend.blend_move(g.means, g.quats, probs, twists)
-    return GaussianTensors(means, quats, g.log_scales, g.opacity_logits, g.sh)
+    return g.placed(means, quats)

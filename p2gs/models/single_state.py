@@ -14,9 +14,9 @@ from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.handover import StateGaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
 from p2gs.models.phase import Phase, PhaseConfig, exponential, register_phase
-from p2gs.models.splats import Splats
+from p2gs.models.splats import Splats, SplitGaussians
 from p2gs.models.visibility import visible_share
-from p2gs.render import rasterize
+from p2gs.render import rasterize_stored
 from p2gs.types import Camera, GaussianTensors, RenderOutput, TwoStateScene
 
 
@@ -130,13 +130,15 @@ class ImagePhase(Phase):
 
 
 def render_gaussians(g: GaussianTensors, camera: Camera, background: Tensor | None = None, **options) -> RenderOutput:
-    """``render.rasterize`` of stored parameters; depth moments are taken about the distance of the origin (the box's centre)."""
-    return rasterize(
+    """``render.rasterize_stored`` of Gaussians; depth moments are taken about the distance of the origin (the box's centre)."""
+    sh, sh_rest = (g.sh0, g.sh_rest) if isinstance(g, SplitGaussians) else (g.sh, None)
+    return rasterize_stored(
         g.means,
         g.quats,
-        g.log_scales.exp(),
-        torch.sigmoid(g.opacity_logits),
-        g.sh,
+        g.log_scales,
+        g.opacity_logits,
+        sh,
+        sh_rest,
         camera.viewmat,
         camera.K,
         camera.width,

@@ -2,10 +2,28 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from torch import Tensor, nn
 
 from p2gs.types import GaussianTensors
+
+
+class SplitGaussians(GaussianTensors):
+    """Gaussians whose harmonics lie in two tensors, sh0 [N, 1, 3] and sh_rest [N, B-1, 3]; ``sh`` is joined when it is asked for."""
+
+    def __init__(self, means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, sh0: Tensor, sh_rest: Tensor):
+        self.means, self.quats, self.log_scales, self.opacity_logits = means, quats, log_scales, opacity_logits
+        self.sh0, self.sh_rest = sh0, sh_rest
+
+    @cached_property
+    def sh(self) -> Tensor:
+        """[N, B, 3]."""
+        return torch.cat([self.sh0, self.sh_rest], dim=1)
+
+    def placed(self, means: Tensor, quats: Tensor) -> "SplitGaussians":
+        return SplitGaussians(means, quats, self.log_scales, self.opacity_logits, self.sh0, self.sh_rest)
 
 
 class Splats(nn.Module):
@@ -57,7 +75,7 @@ class Splats(nn.Module):
 
     def tensors(self) -> GaussianTensors:
         """The parameters as they are (with gradients)."""
-        return GaussianTensors(self.means, self.quats, self.log_scales, self.opacity_logits, self.sh)
+        return SplitGaussians(self.means, self.quats, self.log_scales, self.opacity_logits, self.sh0, self.sh_rest)
 
     def note_gradients(self, abs_grad: Tensor, radii: Tensor, scale: float) -> None:
         """Add one view's screen-space gradients (|d loss / d mean2d|, [N], pixels) to the statistics, times ``scale``."""

@@ -45,10 +45,10 @@ public:
         if (frame_ && pool.idle.size() < kKeepIdle) pool.idle.push_back(std::move(frame_));
     }
 
-    // addresses: means, quats, scales, opacities, sh, features, background | colour, alpha, depth, depth_sq, median, features, radii
-    void forward(const std::array<Address, 14>& at, int64_t n, int sh_bases, int sh_degree, int num_features,
+    // addresses: means, quats, scales, opacities, sh, features, background | colour, alpha, depth, depth_sq, median, features, radii | sh_rest
+    void forward(const std::array<Address, 15>& at, int64_t n, int sh_bases, int sh_degree, int num_features,
                  const std::array<float, 16>& view, const std::array<float, 4>& camera, int width, int height, float near_plane,
-                 float eps2d, float depth_ref, bool background_image, bool keep, int threads) {
+                 float eps2d, float depth_ref, bool background_image, bool stored, bool keep, int threads) {
         RasterArgs& a = args_;
         a = {};
         a.n = n;
@@ -66,6 +66,8 @@ public:
         a.median = pointer<float>(at[11]);
         a.features_out = pointer<float>(at[12]);
         a.radii = pointer<int32_t>(at[13]);
+        a.sh_rest = pointer<const float>(at[14]);
+        a.stored = stored;
         a.sh_bases = sh_bases;
         a.sh_degree = sh_degree;
         a.num_features = num_features;
@@ -81,8 +83,8 @@ public:
         frame_->forward(a, keep, threads < 1 ? 1 : threads);
     }
 
-    // gradients of colour, alpha, depth, depth_sq, features | to means, quats, scales, opacities, sh, features, abs_grad
-    void backward(const std::array<Address, 12>& at, int threads) {
+    // gradients of colour, alpha, depth, depth_sq, features | to means, quats, scales, opacities, sh, features, abs_grad, sh_rest
+    void backward(const std::array<Address, 13>& at, int threads) {
         RasterGrads g = {};
         g.colour = pointer<const float>(at[0]);
         g.alpha = pointer<const float>(at[1]);
@@ -96,6 +98,7 @@ public:
         g.sh = pointer<float>(at[9]);
         g.v_features = pointer<float>(at[10]);
         g.abs_grad = pointer<float>(at[11]);
+        g.sh_rest = pointer<float>(at[12]);
         nb::gil_scoped_release release;
         frame_->backward(args_, g, threads < 1 ? 1 : threads);
     }
@@ -113,11 +116,12 @@ void bind_raster(nb::module_& m) {
         .def(nb::init<>())
         .def("forward", &RasterView::forward,
              "addresses (means, quats, scales, opacities, sh, features, background, colour, alpha, depth, depth_sq, median, features out, "
-             "radii; 0 = none), n, sh_bases, sh_degree, num_features, viewmat (16 floats), (fx, fy, cx, cy), width, height, near, eps2d, "
-             "depth_ref, background is an image, backward will follow, threads")
+             "radii, sh_rest; 0 = none), n, sh_bases, sh_degree, num_features, viewmat (16 floats), (fx, fy, cx, cy), width, height, near, eps2d, "
+             "depth_ref, background is an image, stored (scales are logarithms, opacities logits), backward will follow, threads. With sh_rest, sh is "
+             "the constant band alone.")
         .def("backward", &RasterView::backward,
              "addresses (gradients by colour, alpha, depth, depth_sq, features; gradients to means, quats, scales, opacities, sh, features, "
-             "abs_grad; 0 = none), threads");
+             "abs_grad, sh_rest; 0 = none), threads");
 }
 
 }  // namespace p2gs

@@ -52,6 +52,8 @@ struct RasterPairs {
 struct RasterArgs {
     int64_t n;
     const float *means, *quats, *scales, *opacities, *sh, *features;
+    const float* sh_rest;  // null: sh holds all bases; else sh holds the constant one and this the others
+    bool stored;           // scales are logarithms and opacities logits
     int sh_bases, sh_degree, num_features;
     float view[12];  // rows of world -> camera
     float fx, fy, cx, cy, near_plane, eps2d, depth_ref;
@@ -66,7 +68,7 @@ struct RasterArgs {
 // d loss / d outputs (each may be null) and where d loss / d inputs go (abs_grad and v_features may be null).
 struct RasterGrads {
     const float *colour, *alpha, *depth, *depth_sq, *features;
-    float *means, *quats, *scales, *opacities, *sh, *v_features, *abs_grad;
+    float *means, *quats, *scales, *opacities, *sh, *sh_rest, *v_features, *abs_grad;
 };
 
 // Working memory of one view, kept from forward to backward.

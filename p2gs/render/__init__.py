@@ -11,6 +11,7 @@ import importlib
 import warnings
 from typing import Optional
 
+import torch
 from torch import Tensor
 
 from p2gs.native import native, warn_missing_once
@@ -18,7 +19,7 @@ from p2gs.registry import suggest
 from p2gs.render.base import RASTERIZERS, Rasterizer, RenderInputs, check
 from p2gs.types import RenderOutput, UserError
 
-__all__ = ["RASTERIZERS", "RenderInputs", "find_rasterizer", "rasterize"]
+__all__ = ["RASTERIZERS", "RenderInputs", "find_rasterizer", "rasterize", "rasterize_stored"]
 
 _BUILT_IN = ("cpu", "gsplat", "torch_ref")
 _warned: set[str] = set()
@@ -98,3 +99,44 @@ def rasterize(
     )  # fmt: skip
     check(inputs, sh_degree, median_depth)
     return find_rasterizer(_auto(means) if backend == "auto" else backend)(inputs)
+
+
+def rasterize_stored(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    opacity_logits: Tensor,
+    sh: Tensor,
+    sh_rest: Optional[Tensor],
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    sh_degree: Optional[int] = None,
+    background: Optional[Tensor] = None,
+    features: Optional[Tensor] = None,
+    backend: str = "auto",
+    **options,
+) -> RenderOutput:
+    """``rasterize`` of parameters as they are stored: with exp(log_scales) [N, 3], sigmoid(opacity_logits) [N] and joined harmonics.
+
+    sh_rest: None, or [N, B-1, 3] where ``sh`` [N, 1, 3] is the constant band alone. All else as in ``rasterize``, gradients are by what is
+    given. The backend "cpu" reads the parameters themselves; for the others torch makes what they want.
+    """
+    if sh_rest is not None and sh_rest.shape[1] == 0:
+        sh_rest = None
+    name = _auto(means) if backend == "auto" else backend
+    options = {"depth_sq": False, "depth_ref": 0.0, "near": 0.01, "eps2d": 0.3, "absgrad": False, "median_depth": None, **options}
+    if name != "cpu":
+        sh = sh if sh_rest is None else torch.cat([sh, sh_rest], 1)
+        activated = (means, quats, log_scales.exp(), torch.sigmoid(opacity_logits), sh)
+        options |= {"sh_degree": sh_degree, "background": background, "features": features, "backend": name}
+        return rasterize(*activated, viewmat, K, width, height, **options)
+    median = options.pop("median_depth")
+    inputs = RenderInputs(
+        means, quats, log_scales, opacity_logits, sh, viewmat, K, int(width), int(height), -1, features, background,
+        median_depth=False, stored=True, sh_rest=sh_rest, **options,
+    )  # fmt: skip
+    check(inputs, sh_degree, median)
+    return find_rasterizer(name)(inputs)

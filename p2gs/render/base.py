@@ -41,6 +41,9 @@ class RenderInputs:
     eps2d: float
     absgrad: bool
     median_depth: bool
+    # ``rasterize_stored``, for the backend "cpu" alone: scales are logarithms and opacities logits, ``sh`` is the constant band
+    stored: bool = False
+    sh_rest: Optional[Tensor] = None
 
 
 Rasterizer = Callable[[RenderInputs], RenderOutput]
@@ -65,10 +68,14 @@ def check(a: RenderInputs, sh_degree: Optional[int], median_depth: Optional[bool
     _expect("K", a.K, 3, 3)
     if a.width < 1 or a.height < 1:
         raise ValueError(f"rasterize: width and height must be at least 1, got {a.width} x {a.height}")
-    available = degree_of(a.sh.shape[1])
+    bases = a.sh.shape[1]
+    if a.sh_rest is not None:
+        _expect("sh_rest", a.sh_rest, n, None, 3)
+        bases += a.sh_rest.shape[1]
+    available = degree_of(bases)
     a.sh_degree = available if sh_degree is None else int(sh_degree)
     if not 0 <= a.sh_degree <= available:
-        raise ValueError(f"rasterize: sh_degree {sh_degree} needs {(int(sh_degree) + 1) ** 2} coefficients, sh has {a.sh.shape[1]}")
+        raise ValueError(f"rasterize: sh_degree {sh_degree} needs {(int(sh_degree) + 1) ** 2} coefficients, sh has {bases}")
     if a.features is not None:
         _expect("features", a.features, n, None)
         if not 1 <= a.features.shape[1] <= MAX_FEATURES:
@@ -77,7 +84,7 @@ def check(a: RenderInputs, sh_degree: Optional[int], median_depth: Optional[bool
         _expect("background", a.background, a.height, a.width, 3)
     elif a.background is not None:
         _expect("background", a.background, 3)
-    others = (a.quats, a.scales, a.opacities, a.sh, a.features, a.background)
+    others = (a.quats, a.scales, a.opacities, a.sh, a.sh_rest, a.features, a.background)
     for t in others:
         if t is not None and t.device != a.means.device:
             raise ValueError(f"rasterize: all tensors must be on one device, got {a.means.device} and {t.device}")

@@ -24,7 +24,7 @@ def _address(t: Optional[Tensor]) -> int:
     return 0 if t is None else t.data_ptr()
 
 
-def _forward(a: RenderInputs, keep: bool, means, quats, scales, opacities, sh, features, background):
+def _forward(a: RenderInputs, keep: bool, means, quats, scales, opacities, sh, features, background, sh_rest):
     """Renders; returns the native view (needed for backward) and (colour, alpha, depth, depth_sq, features, median, radii)."""
     h, w, n = a.height, a.width, means.shape[0]
     colour, alpha, depth = torch.empty(h, w, 3), torch.empty(h, w), torch.empty(h, w)
@@ -37,28 +37,30 @@ def _forward(a: RenderInputs, keep: bool, means, quats, scales, opacities, sh, f
     view = native.RasterView()
     inputs = (means, quats, scales, opacities, sh, features, background)
     outputs = (colour, alpha, depth, depth_sq, median, features_out, radii)
+    bases = sh.shape[1] + (0 if sh_rest is None else sh_rest.shape[1])
+    image = background is not None and background.dim() == 3
     view.forward(
-        [_address(t) for t in (*inputs, *outputs)], n, sh.shape[1], a.sh_degree, channels, a.viewmat.reshape(-1).tolist(),
-        [fx, fy, cx, cy], w, h, a.near, a.eps2d, a.depth_ref, background is not None and background.dim() == 3, keep, num_threads(),
+        [_address(t) for t in (*inputs, *outputs, sh_rest)], n, bases, a.sh_degree, channels, a.viewmat.reshape(-1).tolist(),
+        [fx, fy, cx, cy], w, h, a.near, a.eps2d, a.depth_ref, image, a.stored, keep, num_threads(),
     )  # fmt: skip
     return view, (colour, alpha, depth, depth_sq, features_out, median, radii)
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, a: RenderInputs, abs_grad, means, quats, scales, opacities, sh, features, background):
+    def forward(ctx, a: RenderInputs, abs_grad, means, quats, scales, opacities, sh, features, background, sh_rest):
         ctx.set_materialize_grads(False)
-        view, out = _forward(a, True, means, quats, scales, opacities, sh, features, background)
+        view, out = _forward(a, True, means, quats, scales, opacities, sh, features, background, sh_rest)
         ctx.view, ctx.abs_grad = view, abs_grad
         # the kernels read these again: saving them lets autograd notice when somebody has written into one
-        ctx.save_for_backward(means, quats, scales, opacities, sh, features, background, *out[:5])
+        ctx.save_for_backward(means, quats, scales, opacities, sh, features, background, sh_rest, *out[:5])
         ctx.mark_non_differentiable(*(t for t in out[5:] if t is not None))
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, colour, alpha, depth, depth_sq, features_out, *_):
-        means, quats, scales, opacities, sh, features, background, _, out_alpha, *_ = ctx.saved_tensors
+        means, quats, scales, opacities, sh, features, background, sh_rest, _, out_alpha, *_ = ctx.saved_tensors
         incoming = [_plain(g) for g in (colour, alpha, depth, depth_sq, features_out)]
         gradients = [torch.empty_like(t) for t in (means, quats, scales, opacities, sh)]
         # without a gradient by the rendered features, theirs is zero and the kernels take the path without them
@@ -68,13 +70,14 @@ class _Rasterize(torch.autograd.Function):
         native_features = v_features if features_out is not None else None
         if features_out is not None and v_features is None:
             native_features = torch.empty_like(features)
-        ctx.view.backward([_address(t) for t in (*incoming, *gradients, native_features, ctx.abs_grad)], num_threads())
+        v_rest = None if sh_rest is None else torch.empty_like(sh_rest)
+        ctx.view.backward([_address(t) for t in (*incoming, *gradients, native_features, ctx.abs_grad, v_rest)], num_threads())
         v_background = None
         if background is not None and ctx.needs_input_grad[8] and colour is not None:
             v_background = (1 - out_alpha)[..., None] * incoming[0]
             if background.dim() == 1:  # in double: the same float for any number of threads
                 v_background = v_background.double().sum((0, 1)).float()
-        return None, None, *gradients, v_features, v_background
+        return None, None, *gradients, v_features, v_background, v_rest
 
 
 @RASTERIZERS.register("cpu")
@@ -82,7 +85,7 @@ def rasterize_cpu(a: RenderInputs) -> RenderOutput:
     """See ``p2gs.render.rasterize``. Inputs that are not contiguous float32 are converted; outputs are float32."""
     if a.means.device.type != "cpu":
         raise UserError(f"the rasterizer 'cpu' renders tensors on the CPU, these are on {a.means.device}")
-    tensors = [_plain(t) for t in (a.means, a.quats, a.scales, a.opacities, a.sh, a.features, a.background)]
+    tensors = [_plain(t) for t in (a.means, a.quats, a.scales, a.opacities, a.sh, a.features, a.background, a.sh_rest)]
     abs_grad = torch.zeros(a.means.shape[0]) if a.absgrad else None
     if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors):
         out = _Rasterize.apply(a, abs_grad, *tensors)
