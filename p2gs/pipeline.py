@@ -297,7 +297,7 @@ class Pipeline:
         for note in notes:
             print(note, flush=True)
         stages = StageResults(states, motions, canonical, learned, record, notes)
-        options = {"min_margin": config.polish.min_margin, "backend": self.cfg.rasterizer, "device": device}
+        options = {"min_margin": config.unclear, "backend": self.cfg.rasterizer, "device": device}
         write_diagnosis(self.run_dir, stages, obj, self.views, **options)
         write_twin(obj, self.run_dir, self.scene)
         if config.exports:

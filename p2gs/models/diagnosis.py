@@ -51,7 +51,7 @@ def diagnose(
 ) -> dict:
     """What RUN/diagnostics.json holds, without verdicts and losses.
 
-    views: photographs by state.  min_margin: labels less clear than this count as ambiguous (the polish leaves them out).
+    views: photographs by state.  min_margin: labels less clear than this count as ambiguous.
     """
     states, motions, canonical, learned, record = stages.states, stages.motions, stages.canonical, stages.learned, stages.record
     unit = 1.0 / twin.similarity.scale

@@ -35,10 +35,11 @@ class FinishConfig:
     majority among this many neighbours at canonical time (0 = as learned). islands: pieces of a part smaller than this share of its
     largest go to what they touch (0 = off). exports: simulator formats written at the end of a fit, with meshes and report (empty:
     neither; `p2gs export` makes them later). extend_range: joint limits go on beyond the observed motion until the part touches another
-    one (half a turn, the object's diagonal at most); off: they are the observed motion.
+    one (half a turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians whose majority exceeds the rest
+    by less are shown as such in the diagnosis (0..1).
     """
 
-    polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.8))
+    polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0, rim=2.0))
     tune: TuneConfig = field(default_factory=TuneConfig)
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     min_mass: float = 0.002
@@ -48,6 +49,7 @@ class FinishConfig:
     islands: float = 0.25
     exports: list[str] = field(default_factory=lambda: ["urdf", "mjcf", "glb"])
     extend_range: bool = False
+    unclear: float = 0.8
 
 
 @dataclass

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
@@ -30,7 +31,9 @@ class PolishConfig:
     differs between states while structure does not.  min_margin: Gaussians whose label is less clear than this (internal units)
     are left out.  free_static, free_moving: so are those which the other state's cameras see through by more than this, of the base and
     of moving parts (internal units; 0 = kept).  front: a view has no say on a surface that its own state's cameras saw from directions
-    whose cosine with the view's is below this (-1: all views have).
+    whose cosine with the view's is below this (-1: all views have).  rim: in and around a turning part a pixel counts as much as the
+    part covers it, to this power (0: all pixels count alike). A turn lays bare faces beside the rim which the other state never
+    saw; what does see the rim pulls it over them. A slide shows the same faces in both states.
     """
 
     steps: int = 200
@@ -43,6 +46,7 @@ class PolishConfig:
     free_static: float = 0.02
     free_moving: float = 0.05
     front: float = 0.2
+    rim: float = 0.0
 
     def level(self, fraction: float) -> int:
         """Image size when this share of the steps is done."""
@@ -118,6 +122,14 @@ def apply_step(T: Tensor, centre: Tensor, radius: Tensor | float, step: Tensor) 
     return se3.make(R, centre - (R @ centre[..., None])[..., 0] + step[..., 3:]) @ T
 
 
+def say_of_pixels(turning: Tensor, power: float, reach: int = 3) -> Tensor:
+    """Weight of each pixel [H, W]: ``turning`` (what the moved turning parts cover, 0..1) to ``power`` within ``reach`` pixels of
+    such a part, 1 elsewhere.
+    """
+    near = F.max_pool2d((turning > 0.02).float()[None, None], 2 * reach + 1, 1, reach)[0, 0] > 0.5
+    return torch.where(near, turning.clamp(0, 1) ** power, 1.0)
+
+
 @dataclass
 class Side:
     """Frozen Gaussians of one state, labels [N] (part of each, -1 leaves it out) and the other state's photographs.
@@ -162,6 +174,8 @@ def polish(
         fronts.append(None if side.seen_from is None else side.seen_from[labels >= 0].to(device))
     enough = [torch.bincount(body.labels, minlength=len(types) + 1)[1:].cpu() >= 10 for body in bodies]
     slides = torch.tensor([kind == "prismatic" for kind in types])
+    turns = torch.cat([torch.zeros(1), (~slides).float()]).to(device)
+    turning = [turns[body.labels][:, None] if config.rim > 0 and not slides.all() else None for body in bodies]
     anchors, radius = _anchors(sides, bodies, transforms)
     first, second = torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
     taken = torch.zeros(len(transforms), 1)
@@ -177,8 +191,12 @@ def polish(
         means, quats, sh = body.moved(se3.inverse(transforms) if side.back else transforms)
         means.requires_grad_(True)
         quats.requires_grad_(True)
-        out = body.render(means, quats, sh, shot.camera, background, backend)
-        loss = l1_ssim(out.colour, shot.image.to(out.colour.device), config.ssim_lambda)
+        out = body.render(means, quats, sh, shot.camera, background, backend, turning[turn])
+        target = shot.image.to(out.colour.device)
+        colour = out.colour
+        if turning[turn] is not None:
+            colour = target + say_of_pixels(out.features.detach()[..., 0], config.rim)[..., None] * (colour - target)
+        loss = l1_ssim(colour, target, config.ssim_lambda)
         loss.backward()
         if fraction >= 0.9:
             losses[turn].append(float(loss.detach()))
