@@ -74,11 +74,13 @@ class Contact(Loss):
             return None
         movable = movable[sample_rows(len(movable), self.sample, inputs.step, movable.device)]
         means, label = parts.means_canonical, labels[movable]
-        pose = parts.at(self.times[inputs.step % len(self.times)])[label]
-        points = (pose[:, :3, :3] * means[movable, None, :]).sum(-1) + pose[:, :3, 3]
-        _, nearest = knn(means.detach()[static], points.detach(), 1, False)
-        centre = ((labels == 0).to(means)[None] @ means)[0] / len(static)
-        from_base, from_centre = points - means[static[nearest[:, 0]]], points - centre
+        # index_select throughout: it and its gradient are several times faster than indexing
+        poses = parts.at(self.times[inputs.step % len(self.times)])[:, :3].flatten(1)
+        pose = poses.index_select(0, label).unflatten(1, (3, 4))
+        points = (pose[:, :, :3] * means.index_select(0, movable)[:, None, :]).sum(-1) + pose[:, :, 3]
+        _, nearest = knn(means.detach().index_select(0, static), points.detach(), 1, False)
+        centre = means.index_select(0, static).mean(0)
+        from_base, from_centre = points - means.index_select(0, static[nearest[:, 0]]), points - centre
         cosine = torch.cosine_similarity(from_base, from_centre, dim=-1, eps=1e-12)
         penalty = (-cosine).clamp_min(0)
         if self.variant == "margin":

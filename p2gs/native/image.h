@@ -9,14 +9,14 @@ constexpr int64_t kPixels = 1 << 13;  // of a chunk
 
 struct CrossEntropy {
     const float *pred, *target;
-    float* grad;  // null: value only
+    float* grad;  // null: the value, else the gradient
     float low, high, scale;  // pred is clamped to [low, high]; gradient of the sum times `scale`
 };
 
 // sum over pixels with target above one half of alpha depth_sq - (depth - ref alpha)^2, and its gradients times `scale`.
 struct DepthSpread {
     const float *alpha, *depth, *depth_sq, *target;
-    float *v_alpha, *v_depth, *v_depth_sq;  // all null: value only
+    float *v_alpha, *v_depth, *v_depth_sq;  // all null: the value, else the gradients
     float ref, scale;
 };
 

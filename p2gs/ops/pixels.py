@@ -43,36 +43,42 @@ def depth_spread(alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor,
     return ((alpha * depth_sq - first * first) * inside).sum() / inside.sum().clamp_min(1)
 
 
-class _CrossEntropy(torch.autograd.Function):
-    """The gradient comes with the value and waits for the factor of the backward pass."""
+# The gradients are made in the backward pass: their factor is known there, and no pass over the pixels is spent on it alone.
 
+
+class _CrossEntropy(torch.autograd.Function):
     @staticmethod
     def forward(ctx, pred, target, eps):
         pred, target = pred.contiguous(), target.contiguous()
-        ctx.grad = torch.empty_like(pred) if ctx.needs_input_grad[0] else None
-        address = 0 if ctx.grad is None else ctx.grad.data_ptr()
-        value = native.cross_entropy(pred.data_ptr(), target.data_ptr(), address, pred.numel(), eps, 1 - eps, num_threads())
-        return pred.new_tensor(value)
+        ctx.save_for_backward(pred, target)
+        ctx.eps = eps
+        return pred.new_tensor(native.cross_entropy(pred.data_ptr(), target.data_ptr(), 0, pred.numel(), eps, 1 - eps, 1.0, num_threads()))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_output):
-        return ctx.grad * grad_output, None, None
+        pred, target = ctx.saved_tensors
+        out = torch.empty_like(pred)
+        addresses = [t.data_ptr() for t in (pred, target, out)]
+        native.cross_entropy(*addresses, pred.numel(), ctx.eps, 1 - ctx.eps, grad_output.item(), num_threads())
+        return out, None, None
 
 
 class _DepthSpread(torch.autograd.Function):
     @staticmethod
     def forward(ctx, alpha, depth, depth_sq, target, ref):
         inputs = [t.contiguous() for t in (alpha, depth, depth_sq, target)]
-        ctx.grads = torch.empty(3, *alpha.shape) if any(ctx.needs_input_grad[:3]) else None
-        grads = [0, 0, 0] if ctx.grads is None else [g.data_ptr() for g in ctx.grads]
-        value = native.depth_spread([*(t.data_ptr() for t in inputs), *grads], alpha.numel(), ref, num_threads())
-        return alpha.new_tensor(value)
+        ctx.save_for_backward(*inputs)
+        ctx.ref = ref
+        return alpha.new_tensor(native.depth_spread([*(t.data_ptr() for t in inputs), 0, 0, 0], alpha.numel(), ref, 1.0, num_threads()))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_output):
-        return *(ctx.grads * grad_output).unbind(0), None, None
+        inputs = ctx.saved_tensors
+        out = [torch.empty_like(inputs[0]) for _ in range(3)]
+        native.depth_spread([t.data_ptr() for t in (*inputs, *out)], out[0].numel(), ctx.ref, grad_output.item(), num_threads())
+        return *out, None, None
 
 
 def compose(colour: Tensor, alpha8: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
