@@ -9,7 +9,7 @@ from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs, PartState, register_loss
 from p2gs.losses.parts import sample_rows
-from p2gs.ops import se3, so3
+from p2gs.ops import so3
 from p2gs.ops.repel import repel_force
 
 
@@ -127,17 +127,17 @@ class Art(Loss):
             return None
         parts = inputs.parts
         if self.source == "observed":
-            moved = se3.apply(parts.transforms, pairs.mu0)
+            moved = carried(parts.transforms, pairs.mu0)
         else:
-            moved = se3.apply(parts.at(1.0), parts.means_canonical[pairs.index])
+            moved = carried(parts.at(1.0), parts.means_canonical.index_select(0, pairs.index))
         tau = self.tau(inputs)
         if self.variant == "paper":
-            blended = (pairs.probs.T[..., None] * moved).sum(0)
+            blended = (pairs.probs.T[:, None] * moved).sum(0).T
             movable = 1 - pairs.probs[:, :1]
             per_pair = squared(blended + movable * self.force(blended, parts, tau) - pairs.mu1, self.robust, parts.extent)
         else:
-            cost = squared(self.push(moved, pairs.probs, parts, tau) - pairs.mu1, self.robust, parts.extent)
-            per_pair = (pairs.probs * cost.T).sum(-1)
+            cost = squared(self.push(moved, pairs.probs, parts, tau) - pairs.mu1.T, self.robust, parts.extent, dim=1)
+            per_pair = (pairs.probs.T * cost).sum(0)
         total = reduce_pairs(per_pair, self.reduce, len(parts.pairs))
         if self.lambda_rot and parts.target_rotation is not None and len(parts.transforms) > 1:
             angle = so3.rotation_angle(parts.transforms[1:, :3, :3], parts.target_rotation[1:])
@@ -168,8 +168,12 @@ class Art(Loss):
         return force if self.sign == "paper" else -force
 
     def push(self, moved: Tensor, probs: Tensor, parts: PartState, tau: float) -> Tensor:
-        """moved [K, M, 3] plus the force on every candidate that has the membership for it."""
+        """moved [K, 3, M] plus the force on every candidate that has the membership for it."""
+        if parts.repel_points is None or self.k_r == 0 or tau <= 0:
+            return moved
         feels = probs.detach().T > self.min_prob
         feels[0] = False
-        k, i = feels.nonzero(as_tuple=True)
-        return moved.index_put((k, i), self.force(moved[k, i], parts, tau), accumulate=True)
+        (chosen,) = feels.flatten().nonzero(as_tuple=True)
+        flat = moved.transpose(0, 1).flatten(1)
+        force = self.force(flat.index_select(1, chosen).T, parts, tau)
+        return flat.scatter_add(1, chosen.expand(3, -1), force.T).unflatten(1, feels.shape).transpose(0, 1)
