@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Iterable
 
 import torch
@@ -57,7 +56,7 @@ class NamedAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        items, alive, touched = [], [], []
+        items, alive, touched = [], [], []  # the kernel counts the steps too: ten tensors of one number take torch longer than it
         for group in self.param_groups:
             (beta1, beta2), eps, lr = group["betas"], group["eps"], float(group["lr"])
             for param in group["params"]:
@@ -68,8 +67,6 @@ class NamedAdam(torch.optim.Adam):
                     state["step"] = torch.tensor(0.0)
                     state["exp_avg"] = torch.zeros_like(param)
                     state["exp_avg_sq"] = torch.zeros_like(param)
-                state["step"] += 1
-                t = state["step"].item()
                 grad = param.grad.contiguous()
                 alive.append(grad)
                 touched.append(param)
@@ -79,12 +76,12 @@ class NamedAdam(torch.optim.Adam):
                         grad.data_ptr(),
                         _dense(state, "exp_avg").data_ptr(),
                         _dense(state, "exp_avg_sq").data_ptr(),
+                        state["step"].data_ptr(),
                         param.numel(),
-                        lr / (1 - beta1**t),
+                        lr,
                         beta1,
                         beta2,
                         eps,
-                        math.sqrt(1 - beta2**t),
                     )
                 )
         native.adam_step(items, num_threads())
@@ -98,9 +95,14 @@ class NamedAdam(torch.optim.Adam):
             and p.device.type == "cpu"
             and p.is_contiguous()
             and (p.grad is None or (p.grad.dtype == torch.float32 and not p.grad.is_sparse))
+            and self._counts_in_memory(p)
             for group in self.param_groups
             for p in group["params"]
         )
+
+    def _counts_in_memory(self, param: torch.Tensor) -> bool:
+        step = self.state[param].get("step") if param in self.state else None
+        return step is None or (torch.is_tensor(step) and step.dtype == torch.float32 and step.device.type == "cpu")
 
 
 def _dense(state: dict, key: str) -> torch.Tensor:
