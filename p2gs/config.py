@@ -32,8 +32,8 @@ class Options:
     """Top-level options of a run.
 
     seed: every random choice is a function of it.  run: result folder, default runs/<scene>.  device: auto takes CUDA where
-    there is one.  threads: of torch and the CPU kernels, default all cores.  rasterizer: a registered backend or auto.
-    num_parts: including the static base; auto finds out.  plugins: modules that register losses, callbacks, phases, ...
+    there is one.  threads: of the CPU kernels, and of torch outside training steps, default all cores.  rasterizer: a registered backend
+    or auto.  num_parts: including the static base; auto finds out.  plugins: modules that register losses, callbacks, phases, ...
     """
 
     seed: int = 0

@@ -70,6 +70,17 @@ def fit(phase, folder, until=None, resume=None, densify=True):
     return phase
 
 
+@pytest.mark.parametrize("name", ["single_state", "articulation"])
+def test_same_bits_for_any_number_of_threads(name, scene, views, tmp_path):
+    trained = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        phase = fit(build(name, scene, views), tmp_path / str(threads))
+        assert torch.get_num_threads() == threads
+        trained.append(list(phase.splats.parameters()))
+    assert all(torch.equal(a, b) for a, b in zip(*trained, strict=True))
+
+
 @pytest.mark.parametrize("name", ["single_state", "canonical_fusion", "articulation"])
 def test_resume_is_bit_exact_across_densification(name, scene, views, tmp_path):
     whole = fit(build(name, scene, views), tmp_path / "whole")
