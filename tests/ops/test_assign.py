@@ -19,7 +19,7 @@ def gradients(f, inputs, dtype, temperature):
 
 
 @pytest.mark.parametrize("n", [1, 15, 17, 511, 512, 513, 3000])
-@pytest.mark.parametrize("dim, parts", [(16, 5), (1, 1), (3, 2), (17, 9), (64, 32)])
+@pytest.mark.parametrize("dim, parts", [(16, 5), (16, 2), (16, 8), (32, 3), (1, 1), (3, 2), (17, 9), (64, 32)])
 def test_follows_torch(isa, threads, n, dim, parts):
     inputs = setting(n, dim, parts)
     ours = gradients(soft_assignment, inputs, torch.float32, 0.7)
