@@ -40,7 +40,9 @@ class PartMotionsConfig:
     reconsider: each part's motion, and one more, is searched again amid the others, refined; missing_penalty: relative image loss by
     which a part that comes so must win; missing_confidence, missing_evidence: confidence and evidence that it must have.
     split_reach: a part is tried as two whose motions differ by up to twice this (internal units; 0 = never) where that saves ``split``
-    of its residual; also with a part left out whose evidence is below ``doubtful``.
+    of its residual; also with a part left out whose evidence is below ``doubtful``. Where it saves ``split_fine``, amounts near each other
+    are tried, too: two parts whose motions hardly differ. They must win by split_penalty only, but both directions must tell their
+    difference alike (``ways_disagree`` below split_ways).
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
 
@@ -62,6 +64,9 @@ class PartMotionsConfig:
     missing_evidence: float = 0.005
     split_reach: float = 0.05
     split: float = 0.12
+    split_fine: float = 0.03
+    split_penalty: float = 0.01
+    split_ways: float = 0.35
     doubtful: float = 0.1
     min_confidence: float = 0.02
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)

@@ -12,16 +12,19 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
+from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.discovery.labels import Graph, smooth_labels
 from p2gs.models.handover import PartMotions
-from p2gs.models.screw_polish import MovedGaussians
+from p2gs.models.refine_motions import sides_of
+from p2gs.models.screw_polish import MovedGaussians, PolishConfig, polish
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
 from p2gs.ops.sh import dc_to_rgb
 from p2gs.types import GaussianTensors
 
 FEWEST = 10  # solid Gaussians in each state that a half must have
-STEPS = 9  # amounts tried
+COARSE = tuple(i / 4 for i in range(-4, 5))  # amounts tried, in shares of the reach
+FINE = (-1.0, -0.64, -0.32, -0.16, -0.08, 0.0, 0.08, 0.16, 0.32, 0.64, 1.0)  # and near the one that is known
 SPREAD = 12  # rounds of averaging over neighbours
 
 
@@ -159,16 +162,42 @@ def split_part(
 
 
 def splits(
-    states, motions: PartMotions, views, reach: float, least: float, *, level: int, backend: str, device="cpu"
+    states,
+    motions: PartMotions,
+    views,
+    reach: float,
+    least: float,
+    *,
+    steps: tuple[float, ...] = COARSE,
+    level: int,
+    backend: str,
+    device="cpu",
 ) -> list[tuple[int, PartMotions]]:
     """Each part that is better explained as two, with the motions so.
 
-    reach: how far the two amounts may be from the one (internal units at the part's rim; 0: nothing is tried).  least: share of the part's
-    residual that this must save.
+    reach: how far the two amounts may be from the one (internal units at the part's rim; 0: nothing is tried); steps: the amounts in
+    shares of it.  least: share of the part's residual that this must save.
     """
     if reach <= 0 or not len(motions):
         return []
-    shifts = torch.linspace(-reach, reach, STEPS).tolist()
+    shifts = [reach * step for step in steps]
     costs = amount_costs(states, motions, views, shifts, level=level, backend=backend, device=device)
     found = ((k, split_part(states, motions, k, costs, shifts)) for k in range(len(motions)))
     return [(k, f[1]) for k, f in found if f is not None and f[0] >= least]
+
+
+def ways_disagree(
+    states, motions: PartMotions, pair: tuple[int, int], views, config: PolishConfig, stacks: list[DepthStack], *, seed: int, backend: str,
+    device="cpu",
+) -> float:  # fmt: skip
+    """How far the two directions, refined alone, are from telling one difference between the motions of two parts, 0 (they do) and up.
+
+    |f - b| / |f + b| with f, b the mean displacement of one part's motion against the other's over both parts' points. What a surface's
+    error in its own state makes look like a second motion, the other direction does not confirm: that state's surfaces err otherwise.
+    """
+    told, (a, b) = [], pair
+    points = torch.cat([states[0].gaussians.means[motions.labels[0] == k + 1] for k in pair]).double().cpu()
+    for side in sides_of(states, motions, views, config, stacks):
+        T, _ = polish([side], motions.transforms, motions.types, config, seed=seed, backend=backend, device=device)
+        told.append((se3.apply(T[b], points) - se3.apply(T[a], points)).mean(0))
+    return float((told[0] - told[1]).norm() / (told[0] + told[1]).norm().clamp_min(1e-12))

@@ -14,7 +14,7 @@ from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.islands import settle_islands
 from p2gs.models.joint_confidence import JointEvidence, common_level, measure_joints
 from p2gs.models.part_choices import settle_types, without_part
-from p2gs.models.part_split import splits
+from p2gs.models.part_split import FINE, splits, ways_disagree
 from p2gs.models.refine_motions import explanation_cost, refine
 from p2gs.ops.sh import dc_to_rgb
 
@@ -52,7 +52,8 @@ def reconsider(
 
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``); with each every surfel chooses its
     part anew and the states are re-rendered. A part may also be two of nearly one motion (``splits``), as it is or with a doubtful part
-    left out: what moved by another amount than its neighbour is easily explained by a wild motion. The best of each kind is refined; the
+    left out: what moved by another amount than its neighbour is easily explained by a wild motion. Two whose motions hardly differ save
+    little: they are held to less where both directions tell the difference alike. The best of each kind is refined; the
     image loss must fall by ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part. Junk lowers the loss by as
     much as a small door does: with labels chosen anew, a further part's surface must also be found in both states (discovery's confidence
     at least ``missing_confidence``) and the photographs must hold its joint where it is (``JointEvidence.confidence`` at least
@@ -71,6 +72,9 @@ def reconsider(
         if len(motions) < limit:
             tries["added"] = [(len(motions), m) for m in _with_part(found, states, motions, None)]
             tries["split"] = splits(states, motions, views, config.split_reach, config.split, level=level, **options)
+            tries["finely split"] = splits(
+                states, motions, views, config.split_reach, config.split_fine, steps=FINE, level=level, **options
+            )
         best = None
         for change, proposed in tries.items():
             if not proposed:
@@ -87,7 +91,12 @@ def reconsider(
                 anew = refine(states, _relabelled(found, states, refined), views, config.coarse, stacks, seed=seed, **options)
                 reached, refined = min((reached, refined), (cost_of(anew), anew), key=lambda t: t[0])
             entry["after"] = reached
-            rank = reached / (1 - (config.missing_penalty if further else config.freedom_penalty))
+            penalty = config.missing_penalty if further else config.freedom_penalty
+            if change == "finely split" and penalty > 1 - reached / cost > config.split_penalty:
+                pair = (part, len(motions))
+                entry["ways"] = ways_disagree(states, refined, pair, views, config.coarse, stacks, seed=seed, **options)
+                penalty = config.split_penalty if entry["ways"] < config.split_ways else penalty
+            rank = reached / (1 - penalty)
             if further and rank < cost:
                 own = _relabelled(found, states, refined)
                 evidence = _evidence(states, own, views, stacks, options)

@@ -1,13 +1,17 @@
 """Two parts of nearly one motion, taken for one: the photographs tell them apart."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tiny import hinge, photographs, slide, textured_panels
 
 from p2gs.data.views import TrainingViews
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.evidence import render_depths
 from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.part_split import amount_costs, residuals_by_gaussian, rim, splits, with_amount
-from p2gs.models.screw_polish import MovedGaussians
+from p2gs.models.part_split import FINE, amount_costs, residuals_by_gaussian, rim, splits, ways_disagree, with_amount
+from p2gs.models.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors
 
@@ -72,3 +76,28 @@ def test_an_amount_more_is_that_displacement_at_the_rim():
     assert costs[0][0].shape == costs[1][1].shape == (600, 3)
     moving = one.labels[0] == 1
     assert int((costs[0][0] * costs[0][1])[moving].sum(0).argmin()) == 1
+
+
+def test_a_small_difference_is_found_by_fine_steps_and_told_alike_by_both_directions():
+    states, one, views, labels = two_halves("prismatic", 0.024)
+    found = splits(states, one, views, 0.05, 0.03, steps=FINE, **OPTIONS)
+    assert [part for part, _ in found] == [0]
+    assert ways(states, found[0][1], views) < 0.35
+
+
+def test_a_surface_that_errs_in_one_state_is_no_second_motion():
+    """One part, but half of it lies off in the start's reconstruction: only start -> end takes it for a motion of its own."""
+    states, one, views, labels = two_halves("prismatic", 0.0)
+    off = states[0].gaussians.clone()
+    off.means[labels == 2] += torch.tensor([0.024, 0.0, 0.0])
+    states[0] = StateGaussians(0, off)
+    two = one.with_motion(1, "prismatic", with_amount(one.transforms[0], "prismatic", 0.01, 1.0))
+    two = replace(two, labels=[labels, labels], confidence=torch.ones(2))
+    assert ways(states, two, views) > 0.5
+
+
+def ways(states, motions, views) -> float:
+    cameras = [views[0].camera(i, 0) for i in range(len(views[0]))]
+    config = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0)
+    stacks = [DepthStack(*render_depths(s.gaussians, cameras, "auto", "cpu"), cameras) for s in states]
+    return ways_disagree(states, motions, (0, 1), views, config, stacks, seed=0, backend="auto")
