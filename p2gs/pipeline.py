@@ -31,6 +31,7 @@ from p2gs.models.phase import Phase
 from p2gs.models.single_state import SingleStatePhase
 from p2gs.native import keep_memory
 from p2gs.side_stage import SideStage, can_run_beside
+from p2gs.stage_times import note_stage
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError
 
 STAGES = ("single_state", "discovery", "canonical_fusion", "articulation", "finish")
@@ -156,14 +157,10 @@ class Pipeline:
         handover.save(value, self.file(name), key=self.key(name))
         (self.run_dir / "checkpoints" / f"{name}.ckpt").unlink(missing_ok=True)
 
-    def note_time(self, name: str, seconds: float, whose: int = resource.RUSAGE_SELF) -> None:
-        """RUN/logs/stages.json: seconds and peak memory (MiB) of each stage; of a resumed one the last sitting."""
-        path = self.run_dir / "logs" / "stages.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        times = json.loads(path.read_text()) if path.exists() else {}
-        peak = resource.getrusage(whose).ru_maxrss // 1024
-        times[name] = {"seconds": round(seconds, 2), "peak_memory_mib": peak}
-        path.write_text(json.dumps(times, indent=1))
+    def note_time(self, name: str, seconds: float, beside: Optional[str] = None) -> None:
+        """Keep and tell a stage's seconds and peak memory. beside: the stage that ran at the same time, this one in another process."""
+        peak = resource.getrusage(resource.RUSAGE_CHILDREN if beside else resource.RUSAGE_SELF).ru_maxrss // 1024
+        note_stage(self.run_dir, name, seconds, peak, beside)
         print(f"{name}: {seconds:.1f} s, peak memory {peak} MiB", flush=True)
 
     # -- stages ---------------------------------------------------------------------------------------------------------------
@@ -184,7 +181,7 @@ class Pipeline:
             with SideStage(self.run_dir, names[1], threads // 2) as other:
                 first = self.stage(names[0], only, partial(self.train_state, names[0]))
                 seconds = other.wait()
-            self.note_time(names[1], seconds, resource.RUSAGE_CHILDREN)
+            self.note_time(names[1], seconds, beside=names[0])
             return [first, self.done(names[1])]
         finally:
             torch.set_num_threads(threads)

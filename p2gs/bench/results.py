@@ -9,6 +9,7 @@ from typing import Optional
 
 from p2gs.bench.cell import read_record
 from p2gs.bench.published import CHAMFER
+from p2gs.stage_times import stages_file, wall_seconds
 from p2gs.types import UserError
 
 JOINT = ("ang", "pos", "motion")
@@ -69,9 +70,9 @@ def read_run(folder: Path, cell: dict, scene: dict) -> Run:
         return run
     run.status, run.error = "done", None
     read_metrics(run, json.loads((folder / "metrics.json").read_text()))
-    stages = folder / "logs" / "stages.json"
+    stages = stages_file(folder)
     if stages.is_file():
-        run.values["minutes"] = sum(s["seconds"] for s in json.loads(stages.read_text()).values()) / 60
+        run.values["minutes"] = wall_seconds(json.loads(stages.read_text())) / 60
     return run
 
 

@@ -9,6 +9,7 @@ from typing import Any, Optional
 import yaml
 
 from p2gs.callbacks.base import Callback, register_callback
+from p2gs.stage_times import stages_file, wall_seconds
 
 TOP = ("seed", "device", "rasterizer", "num_parts")
 OF_LOSS = ("weight", "variant", "exponent", "k_r")
@@ -93,8 +94,8 @@ def run_scores(run: Path | str) -> dict[str, float]:
     out |= {f"chamfer/{name}": entry["value"] for name, entry in (metrics.get("chamfer") or {}).items() if isinstance(entry, dict)}
     out |= {f"views/{name}": value for name, value in ((metrics.get("views") or {}).get("mean") or {}).items()}
     out |= {f"penetration/{name}": value for name, value in (metrics.get("penetration") or {}).items()}
-    if (run / "logs" / "stages.json").is_file():
-        out["minutes"] = sum(s["seconds"] for s in json.loads((run / "logs" / "stages.json").read_text()).values()) / 60
+    if stages_file(run).is_file():
+        out["minutes"] = wall_seconds(json.loads(stages_file(run).read_text())) / 60
     return {f"score/{k}": float(v) for k, v in out.items() if isinstance(v, (int, float))}
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from p2gs.export.twin_json import load_twin
 from p2gs.ops.palette import part_colour
+from p2gs.stage_times import stages_file, wall_seconds
 from p2gs.types import ArticulatedObject
 
 PAGE_FACES = 15_000  # triangles a part in the page's 3D view
@@ -36,7 +37,7 @@ def write_report(run_dir: Path | str) -> Path:
         doubt_section(run_dir),
         score_section(metrics),
         curve_section(run_dir / "logs"),
-        time_section(_json(run_dir / "logs" / "stages.json")),
+        time_section(_json(stages_file(run_dir))),
     ]
     name = html.escape(run_dir.resolve().name)
     moving = [p for p in obj.parts if p.joint is not None]
@@ -224,7 +225,7 @@ def time_section(stages: Optional[dict]) -> str:
     if not stages:
         return ""
     rows = [[html.escape(k.replace("_", " ")), f"{v['seconds']:.1f}", f"{v['peak_memory_mib']:,}"] for k, v in stages.items()]
-    rows.append(["sum", f"{sum(v['seconds'] for v in stages.values()):.1f}", ""])
+    rows.append(["all", f"{wall_seconds(stages):.1f}", ""])
     return "<h2>Time</h2>\n" + table(["stage", "seconds", "peak memory [MiB]"], rows)
 
 

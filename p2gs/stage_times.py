@@ -1,0 +1,25 @@
+"""RUN/logs/stages.json: what each stage of a run took."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Optional
+
+
+def stages_file(run_dir: Path | str) -> Path:
+    return Path(run_dir) / "logs" / "stages.json"
+
+
+def note_stage(run_dir: Path | str, name: str, seconds: float, peak_memory: int, beside: Optional[str] = None) -> None:
+    """Write a stage's seconds (of a resumed one the last sitting's) and peak memory (MiB). beside: the stage that ran at the same time."""
+    path = stages_file(run_dir)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    times = json.loads(path.read_text()) if path.exists() else {}
+    times[name] = {"seconds": round(seconds, 2), "peak_memory_mib": peak_memory} | ({"beside": beside} if beside else {})
+    path.write_text(json.dumps(times, indent=1))
+
+
+def wall_seconds(stages: dict[str, dict]) -> float:
+    """What the stages took together: one that ran beside another counts by how much longer it took."""
+    return sum(max(s["seconds"] - stages.get(s.get("beside"), {"seconds": 0.0})["seconds"], 0.0) for s in stages.values())
