@@ -178,6 +178,7 @@ class Pipeline:
             anew = only == "single_state" or (only is None and all(self.done(name) is None for name in names))
             if not (beside and anew):
                 return [self.stage(name, only, partial(self.train_state, name)) for name in names]
+            self.views_of(0)  # a scene that is generated when it is first read is written once
             with SideStage(self.run_dir, names[1], threads // 2) as other:
                 first = self.stage(names[0], only, partial(self.train_state, names[0]))
                 seconds = other.wait()
