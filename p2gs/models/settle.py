@@ -123,7 +123,7 @@ def _with_part(found: Discovery, states, motions: PartMotions, part: int | None)
 def _split_without(found: Discovery, states, motions: PartMotions, views, config: PartMotionsConfig, stacks, options: dict):
     """Without each part that the photographs do not hold where it is, labels chosen anew: which other part is two, and the motions so."""
     level, out = config.coarse.levels[-1], []
-    if config.split_reach <= 0:
+    if config.split_reach <= 0 or len(motions) < 2:  # of one part nothing would be left to be two
         return out
     evidence = _evidence(states, motions, views, stacks, options)
     for k in range(len(motions)):

@@ -202,3 +202,7 @@ def test_relabel_by_the_true_motion_labels_like_the_search():
     for s in (0, 1):
         assert float((again.probability[s].argmax(1) == found.probability[s].argmax(1)).float().mean()) > 0.97
     assert again.motions[0].confidence == pytest.approx(found.motions[0].confidence, abs=0.05)
+    nothing = relabel(found, torch.zeros(0, 4, 4).double(), [])  # as when the last part was dropped
+    assert nothing.motions == [] and [p.shape[1] for p in nothing.probability] == [1, 1]
+    label, _ = nothing.label_points(torch.as_tensor(start.points), torch.as_tensor(start.colours), 0)
+    assert not label.any()

@@ -137,7 +137,7 @@ def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int
 def as_motions(transforms: Tensor, types: list[str]) -> Motions:
     """Motions [K] of transforms [K, 4, 4] start -> end of types "revolute" | "prismatic"."""
     screw = se3.screw_parameters(transforms.double())
-    turn = torch.tensor([t == "revolute" for t in types])
+    turn = torch.tensor([t == "revolute" for t in types], dtype=torch.bool)
     amount = torch.where(turn, screw.angle, screw.translation)
     return Motions(turn, screw.axis.float(), screw.origin.float(), amount.float())
 
