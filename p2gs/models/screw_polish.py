@@ -32,8 +32,9 @@ class PolishConfig:
     are left out.  free_static, free_moving: so are those which the other state's cameras see through by more than this, of the base and
     of moving parts (internal units; 0 = kept).  front: a view has no say on a surface that its own state's cameras saw from directions
     whose cosine with the view's is below this (-1: all views have).  rim: in and around a turning part a pixel counts as much as the
-    part covers it, to this power (0: all pixels count alike). A turn lays bare faces beside the rim which the other state never
-    saw; what does see the rim pulls it over them. A slide shows the same faces in both states.
+    part covers it, to this power, but rim_least at least (rim 0: all pixels count alike). A turn lays bare faces beside the rim which
+    the other state never saw; what does see the rim pulls it over them. Of a plain part the rim is all there is to see: so it counts
+    less, not nothing. A slide shows the same faces in both states.
     """
 
     steps: int = 200
@@ -47,6 +48,7 @@ class PolishConfig:
     free_moving: float = 0.05
     front: float = 0.2
     rim: float = 0.0
+    rim_least: float = 0.5
 
     def level(self, fraction: float) -> int:
         """Image size when this share of the steps is done."""
@@ -122,12 +124,12 @@ def apply_step(T: Tensor, centre: Tensor, radius: Tensor | float, step: Tensor) 
     return se3.make(R, centre - (R @ centre[..., None])[..., 0] + step[..., 3:]) @ T
 
 
-def say_of_pixels(turning: Tensor, power: float, reach: int = 3) -> Tensor:
-    """Weight of each pixel [H, W]: ``turning`` (what the moved turning parts cover, 0..1) to ``power`` within ``reach`` pixels of
-    such a part, 1 elsewhere.
+def say_of_pixels(turning: Tensor, power: float, least: float = 0.0, reach: int = 3) -> Tensor:
+    """Weight of each pixel [H, W]: within ``reach`` pixels of a turning part between ``least`` and 1, by ``turning`` (what such parts,
+    moved, cover, 0..1) to ``power``; 1 elsewhere.
     """
     near = F.max_pool2d((turning > 0.02).float()[None, None], 2 * reach + 1, 1, reach)[0, 0] > 0.5
-    return torch.where(near, turning.clamp(0, 1) ** power, 1.0)
+    return torch.where(near, least + (1 - least) * turning.clamp(0, 1) ** power, 1.0)
 
 
 @dataclass
@@ -195,7 +197,7 @@ def polish(
         target = shot.image.to(out.colour.device)
         colour = out.colour
         if turning[turn] is not None:
-            colour = target + say_of_pixels(out.features.detach()[..., 0], config.rim)[..., None] * (colour - target)
+            colour = target + say_of_pixels(out.features.detach()[..., 0], config.rim, config.rim_least)[..., None] * (colour - target)
         loss = l1_ssim(colour, target, config.ssim_lambda)
         loss.backward()
         if fraction >= 0.9:

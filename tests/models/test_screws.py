@@ -95,6 +95,7 @@ def test_pixels_count_as_much_as_turning_parts_cover_them():
     say = say_of_pixels(covered, 2.0)
     assert torch.equal(say[8:12, 8:12], torch.ones(4, 4)) and torch.equal(say[8:12, 12], torch.full((4,), 0.25))
     assert not say[5:8, 8:12].any() and not say[8:12, 13:16].any()  # around it nothing counts
+    assert torch.equal(say_of_pixels(covered, 2.0, 0.5), torch.maximum(0.5 + 0.5 * say, torch.tensor(0.5)))
     assert torch.equal(say[:5], torch.ones(5, 20)) and torch.equal(say[:, 16:], torch.ones(20, 4))  # far from it all do
 
 
@@ -110,7 +111,7 @@ def test_a_face_that_the_other_state_never_saw_pulls_a_turn_less_with_rim():
     side = Side(g, labels, TrainingViews(photos, [64]))
     centre, off = g.means[labels == 1].double().mean(0), {}
     for rim in (0.0, 2.0):
-        config = PolishConfig(steps=120, levels=[64], level_starts=[0.0], rate=1e-2, rim=rim)
+        config = PolishConfig(steps=120, levels=[64], level_starts=[0.0], rate=1e-2, rim=rim, rim_least=0.0)
         found, _ = polish([side], truth[None], ["revolute"], config, seed=0)
         off[rim] = float((se3.apply(found[0], centre[None]) - se3.apply(truth, centre[None])).norm())
     assert off[2.0] < 0.5 * off[0.0] and off[0.0] > 2e-3, off
