@@ -93,6 +93,14 @@ def test_a_run_that_takes_too_long_is_stopped(bench_file, program, monkeypatch):
     assert read_record(bench.cells[0].run)["error"] == "took longer than 0.002 minutes"
 
 
+def test_a_run_whose_scores_were_deleted_is_run_again(bench_file, program):
+    bench = read_bench([bench_file(ONE)])
+    run(bench, program)
+    (Path(bench.cells[0].run) / "metrics.json").unlink()
+    assert sorted(status(c) for c in bench.cells) == ["done", "todo"]
+    assert run(bench, program)[0] == {"done": 2} and is_done(bench.cells[0])
+
+
 def test_scores_of_another_config_do_not_count(bench_file, program):
     run(read_bench([bench_file(ONE)]), program)
     changed = read_bench([bench_file(ONE)], ["--phases.articulation.steps", "9"])
