@@ -66,7 +66,7 @@ class PartMotionsConfig:
     split: float = 0.12
     split_fine: float = 0.03
     split_penalty: float = 0.01
-    split_ways: float = 0.35
+    split_ways: float = 0.27
     doubtful: float = 0.1
     min_confidence: float = 0.02
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
