@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "p2gs"
 
 # what is imported stands in an earlier row, or in the same one
 ORDER = [
-    ("types", "registry"),
+    ("types", "registry", "stage_times"),
     ("schema", "config_files"),
     ("ops", "native"),
     ("render",),
@@ -20,7 +20,7 @@ ORDER = [
     ("models",),
     ("export", "callbacks"),
     ("config",),
-    ("pipeline", "bench"),
+    ("pipeline", "side_stage", "bench"),
     ("app", "commands"),
     ("cli", "__main__"),
 ]
