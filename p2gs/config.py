@@ -165,6 +165,7 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
         data = layer.tree.get("data")
         current = (data.get("format") if isinstance(data, dict) else None) or current
         formats.append(current)
+    current = current or _format_found(layers)
     schema = run_schema(current)
     merged: Plain = {}
     for layer, name in zip(layers, formats, strict=True):
@@ -186,6 +187,24 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
             given = complete(phase.get("callbacks") or {}, schema.children["callbacks"])
             values["phases"][name]["callbacks"] = _mentioned(given, phase.get("callbacks") or {})
     return RunConfig(values, schema)
+
+
+def _format_found(layers: list[Layer]) -> Optional[str]:
+    """The data format that the folder given as data.root looks like; None where no root is given. Raises UserError where it is none."""
+    from p2gs.data.layouts import LAYOUTS, detect_format
+
+    roots = [layer.tree["data"].get("root") for layer in layers if isinstance(layer.tree.get("data"), dict)]
+    given = [Path(root) for root in roots if isinstance(root, str) and root]
+    if not given:
+        return None
+    root = given[-1]
+    if not root.is_dir():
+        raise UserError(f"data.root: the folder {root} is not there")
+    found = detect_format(root)
+    if found is None:
+        known = ", ".join(LAYOUTS)
+        raise UserError(f"data.format is not given, and {root} looks like none of the layouts {known}; give --data.format NAME")
+    return found
 
 
 def _mentioned(values: Plain, tree: Plain) -> Plain:

@@ -1,5 +1,7 @@
 """Merging, switching off, overrides, includes, formats, saving."""
 
+from types import SimpleNamespace
+
 import pytest
 import yaml
 
@@ -127,6 +129,18 @@ def test_data_without_root_or_format_is_told_when_needed(base):
         _ = cfg.data
     with pytest.raises(UserError, match=r"data\.format is not given.*folder, made"):
         _ = load_config([base]).data
+
+
+def test_format_is_found_from_the_folder(base, fakes, tmp_path, monkeypatch):
+    (tmp_path / "box").mkdir()
+    (tmp_path / "box" / "note.txt").touch()
+    with pytest.raises(UserError, match=r"data\.format is not given, and .*box looks like none of the layouts artgs, dta, paris"):
+        load_config([base], ["--data.root", str(tmp_path / "box")])
+    with pytest.raises(UserError, match=r"data\.root: the folder .*nowhere is not there"):
+        load_config([base], ["--data.root", str(tmp_path / "nowhere")])
+    monkeypatch.setattr("p2gs.data.layouts.LAYOUTS", {"folder": SimpleNamespace(detect=lambda root: (root / "note.txt").is_file())})
+    cfg = load_config([base], ["--data.root", str(tmp_path / "box"), "--data.views", "4"])
+    assert cfg.data_options["format"] == "folder" and cfg.data.views == 4
 
 
 def test_changing_the_format_drops_what_only_the_old_one_knew(base, write):

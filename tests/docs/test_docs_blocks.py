@@ -34,6 +34,8 @@ def test_commands_are_understood(page, desk):
     if page is README:  # its example of a loss has no title: `mine.yaml` and my_losses are those blocks
         (desk / "my_losses.py").write_text(next(b.text for b in blocks(page) if b.kind == "python"))
         (desk / "mine.yaml").write_text(next(b.text for b in blocks(page) if b.kind == "yaml"))
+        (desk / "path/to/scene").mkdir(parents=True)
+        (desk / "path/to/scene/transforms_train_start.json").touch()  # a folder of the ArtGS layout, found as such
         assert len(commands) >= 8
     for words in commands:
         words = [w for word in words for w in (["-c", "preset/cpu.yaml"] if word == "..." else [word])]
