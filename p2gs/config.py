@@ -160,12 +160,14 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
     load_plugins(tuple(names))
     import_builtins()
 
-    formats, current = [], None
+    formats, current, root = [], None, None
     for layer in layers:
         data = layer.tree.get("data")
-        current = (data.get("format") if isinstance(data, dict) else None) or current
+        if isinstance(data, dict):
+            current, root = data.get("format") or current, data.get("root") or root
         formats.append(current)
-    current = current or _format_found(layers)
+    if current is None and isinstance(root, str):
+        current = _format_found(Path(root))
     schema = run_schema(current)
     merged: Plain = {}
     for layer, name in zip(layers, formats, strict=True):
@@ -189,15 +191,10 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
     return RunConfig(values, schema)
 
 
-def _format_found(layers: list[Layer]) -> Optional[str]:
-    """The data format that the folder given as data.root looks like; None where no root is given. Raises UserError where it is none."""
+def _format_found(root: Path) -> str:
+    """The data format that the folder given as data.root looks like. Raises UserError where it is none, or there is no such folder."""
     from p2gs.data.layouts import LAYOUTS, detect_format
 
-    roots = [layer.tree["data"].get("root") for layer in layers if isinstance(layer.tree.get("data"), dict)]
-    given = [Path(root) for root in roots if isinstance(root, str) and root]
-    if not given:
-        return None
-    root = given[-1]
     if not root.is_dir():
         raise UserError(f"data.root: the folder {root} is not there")
     found = detect_format(root)
