@@ -29,7 +29,9 @@ class PartMotionsConfig:
 
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
     candidates: how many complete explanations are compared by re-rendering; of more, those that look best after ``look_steps`` of
-    refinement at the smallest size.  coarse: photometric refinement right after discovery.
+    refinement at the smallest size.  contenders: how many of these go on through all that follows, up to ``reconsider``, where they differ
+    and their image loss is within the share ``contend`` of the best: a wrong start may lead nowhere, and a worse one to the truth.
+    coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
     freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: the same for a further part.
     same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one
@@ -49,6 +51,8 @@ class PartMotionsConfig:
     evidence_size: int = 200
     min_opacity: float = 0.5
     candidates: int = 3
+    contenders: int = 2
+    contend: float = 0.1
     look_steps: int = 40
     compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
@@ -120,7 +124,7 @@ def find_part_motions(
         looks = [first_look(e) for e in explanations]
         order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
         explanations = [explanations[i] for i in order]
-    best, costs, tried, level = None, [], [], config.coarse.levels[-1]
+    refined, costs, tried, level = [], [], [], config.coarse.levels[-1]
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
@@ -132,23 +136,31 @@ def find_part_motions(
         costs.append(cost)
         rank = _rank(cost, motions, config)
         tried.append({"types": motions.types, "cost": cost, "rank": rank, "reductions": reductions})
+        refined.append((rank, number, motions))
+    contenders = _contenders(refined, config)
+    limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
+    best, contests = None, []
+    for _, number, motions in contenders:
+        motions = settle_types(states, motions, views, config, stacks, **options)
+        changed: list[dict] = []
+        motions, shifted = leave_false_minima(states, motions, views, config.coarse, stacks, config.survey, **options)
+        if config.reconsider:
+            say("reconsidering each part" + (f" of explanation {number + 1}" if len(contenders) > 1 else ""))
+            motions, changed = reconsider(found, states, motions, views, config, stacks, limit, **options)
+            motions = simplify(states, motions, views, config, backend=backend, device=device, log=changed)
+        rank = _rank(explanation_cost(states, motions, views, level, backend, device), motions, config)
+        contests.append({"explanation": number, "types": motions.types, "rank": rank})
         if best is None or rank < best[0]:
-            best = (rank, motions, number)
-    motions = settle_types(states, best[1], views, config, stacks, **options)
-    changed: list[dict] = []
-    motions, shifted = leave_false_minima(states, motions, views, config.coarse, stacks, config.survey, **options)
-    if config.reconsider:
-        say("reconsidering each part")
-        limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
-        motions, changed = reconsider(found, states, motions, views, config, stacks, limit, **options)
-        motions = simplify(states, motions, views, config, backend=backend, device=device, log=changed)
+            best = (rank, number, motions, shifted, changed)
+    _, number, motions, shifted, changed = best
     say("settling labels and motions")
     motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
     motions, unfounded = drop_unfounded(found, states, motions, views, config, stacks, **options)
     for part in unfounded:
         say(f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})")
     motions.diagnostics = {
-        "explanation": best[2],
+        "explanation": number,
+        "contests": contests,
         "photometric_costs": costs,
         "first_looks": looks,
         "explanations": tried,
@@ -166,6 +178,26 @@ def find_part_motions(
 def _rank(cost: float, motions: PartMotions, config: PartMotionsConfig) -> float:
     """Image loss with a price on every part: lower is better."""
     return cost * (1 + config.part_penalty) ** len(motions)
+
+
+def _contenders(refined: list[tuple[float, int, PartMotions]], config: PartMotionsConfig) -> list[tuple[float, int, PartMotions]]:
+    """Of (rank, number, motions), the best first and those that are nearly as good and say something else."""
+    ordered, out = sorted(refined, key=lambda t: t[:2]), []
+    for rank, number, motions in ordered:
+        close = rank <= ordered[0][0] * (1 + config.contend)
+        if not out or (close and not any(_same(motions, other, config.same_motion) for _, _, other in out)):
+            out.append((rank, number, motions))
+    return out[: max(config.contenders, 1)]
+
+
+def _same(a: PartMotions, b: PartMotions, reach: float) -> bool:
+    """Do both have the same parts: each motion carries the unit box about the origin as one of the other's does, to within ``reach``?"""
+    if len(a) != len(b) or len(a) == 0:
+        return len(a) == len(b)
+    corners = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)
+    moved = [m.transforms[:, None, :3, :3] @ corners[None, :, :, None] + m.transforms[:, None, :3, 3:] for m in (a, b)]
+    apart = (moved[0][:, None] - moved[1][None]).squeeze(-1).norm(dim=-1).amax(-1)
+    return bool((apart.amin(1) < reach).all() and (apart.amin(0) < reach).all())
 
 
 def _explanations(found) -> list:

@@ -53,7 +53,7 @@ def reconsider(
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``); with each every surfel chooses its
     part anew and the states are re-rendered. A part may also be two of nearly one motion (``splits``), as it is or with a doubtful part
     left out: what moved by another amount than its neighbour is easily explained by a wild motion. Two whose motions hardly differ save
-    little: they are held to less where both directions tell the difference alike. The best of each kind is refined; the
+    little, and so do errors of one state: they are held to less, but both directions must tell the difference alike. The best of each kind is refined; the
     image loss must fall by ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part. Junk lowers the loss by as
     much as a small door does: with labels chosen anew, a further part's surface must also be found in both states (discovery's confidence
     at least ``missing_confidence``) and the photographs must hold its joint where it is (``JointEvidence.confidence`` at least
@@ -92,10 +92,12 @@ def reconsider(
                 reached, refined = min((reached, refined), (cost_of(anew), anew), key=lambda t: t[0])
             entry["after"] = reached
             penalty = config.missing_penalty if further else config.freedom_penalty
-            if change == "finely split" and penalty > 1 - reached / cost > config.split_penalty:
+            if change == "finely split" and 1 - reached / cost > config.split_penalty:
                 pair = (part, len(motions))
                 entry["ways"] = ways_disagree(states, refined, pair, views, config.coarse, stacks, seed=seed, **options)
-                penalty = config.split_penalty if entry["ways"] < config.split_ways else penalty
+                if entry["ways"] >= config.split_ways:
+                    continue
+                penalty = config.split_penalty
             rank = reached / (1 - penalty)
             if further and rank < cost:
                 own = _relabelled(found, states, refined)

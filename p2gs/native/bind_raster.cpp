@@ -48,7 +48,7 @@ public:
     // addresses: means, quats, scales, opacities, sh, features, background | colour, alpha, depth, depth_sq, median, features, radii | sh_rest
     void forward(const std::array<Address, 15>& at, int64_t n, int sh_bases, int sh_degree, int num_features,
                  const std::array<float, 16>& view, const std::array<float, 4>& camera, int width, int height, float near_plane,
-                 float eps2d, float depth_ref, bool background_image, bool stored, bool keep, int threads) {
+                 float eps2d, float depth_ref, bool antialias, bool background_image, bool stored, bool keep, int threads) {
         RasterArgs& a = args_;
         a = {};
         a.n = n;
@@ -78,6 +78,7 @@ public:
         a.near_plane = near_plane;
         a.eps2d = eps2d;
         a.depth_ref = depth_ref;
+        a.antialias = antialias;
         a.background_image = background_image;
         nb::gil_scoped_release release;
         frame_->forward(a, keep, threads < 1 ? 1 : threads);
@@ -117,7 +118,7 @@ void bind_raster(nb::module_& m) {
         .def("forward", &RasterView::forward,
              "addresses (means, quats, scales, opacities, sh, features, background, colour, alpha, depth, depth_sq, median, features out, "
              "radii, sh_rest; 0 = none), n, sh_bases, sh_degree, num_features, viewmat (16 floats), (fx, fy, cx, cy), width, height, near, eps2d, "
-             "depth_ref, background is an image, stored (scales are logarithms, opacities logits), backward will follow, threads. With sh_rest, sh is "
+             "depth_ref, antialias, background is an image, stored (scales are logarithms, opacities logits), backward will follow, threads. With sh_rest, sh is "
              "the constant band alone.")
         .def("backward", &RasterView::backward,
              "addresses (gradients by colour, alpha, depth, depth_sq, features; gradients to means, quats, scales, opacities, sh, features, "

@@ -57,6 +57,7 @@ struct RasterArgs {
     int sh_bases, sh_degree, num_features;
     float view[12];  // rows of world -> camera
     float fx, fy, cx, cy, near_plane, eps2d, depth_ref;
+    bool antialias;  // opacities lose what eps2d adds to the area
     int width, height;
     const float* background;  // null, 3 floats, or an image
     bool background_image;

@@ -16,6 +16,7 @@ ALPHA_MIN = 1 / 255  # a Gaussian fainter than this at a pixel is skipped there
 ALPHA_MAX = 0.99  # and none is more opaque
 T_STOP = 1e-4  # a pixel is finished before its transmittance would fall to this
 FAR = 1e10
+EPS2D = 0.1  # variance of a pixel, pixels^2: a box has 1/12, renderers' filters a little more
 MAX_FEATURES = 16
 
 
@@ -39,6 +40,7 @@ class RenderInputs:
     depth_ref: float
     near: float
     eps2d: float
+    antialias: bool
     absgrad: bool
     median_depth: bool
     # ``rasterize_stored``, for the backend "cpu" alone: scales are logarithms and opacities logits, ``sh`` is the constant band

@@ -69,6 +69,7 @@ def through_gsplat(a: RenderInputs) -> RenderOutput:
         eps2d=a.eps2d,
         packed=False,
         absgrad=a.absgrad,
+        rasterize_mode="antialiased" if a.antialias else "classic",
     )
     image, alpha = image[0], alpha[0, ..., 0]
 

@@ -85,6 +85,9 @@ def project(a: RenderInputs, dtype: torch.dtype) -> Splats:
     cxx, cxy, cyy = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
     det = cxx * cyy - cxy * cxy
     conics = torch.stack([cyy / det, -cxy / det, cxx / det], -1)
+    if a.antialias:
+        area = torch.linalg.cross(P[:, 0], P[:, 1]).square().sum(1)  # det without eps2d; xx yy - xy^2 would cancel for needles
+        opacities = opacities * (area / det).clamp_min(1e-12).sqrt()
 
     colour = evaluate(sh, normalize(means + W.T @ t, dim=-1), a.sh_degree).clamp_min(0)
     values = [colour, z[:, None], (z[:, None] - a.depth_ref) ** 2]
@@ -93,7 +96,7 @@ def project(a: RenderInputs, dtype: torch.dtype) -> Splats:
     reach = (2 * torch.log(opacities / ALPHA_MIN)).clamp_min(0).detach().sqrt()
     extents = reach[:, None] * torch.stack([cxx, cyy], -1).detach().sqrt()
     # huge but finite inputs may overflow on the way
-    fine = torch.cat([means2d, cov.flatten(1), conics, colour], 1).isfinite().all(1) & (det > 0)
+    fine = torch.cat([means2d, cov.flatten(1), conics, colour], 1).isfinite().all(1) & (det > 0) & (opacities >= ALPHA_MIN)
     return Splats(*(s[fine] for s in (index, means2d, conics, opacities, torch.cat(values, 1), z, extents)))
 
 

@@ -10,7 +10,9 @@ from worlds import OUTPUTS, backward, relative_error, world
 from p2gs.render import base
 
 
-def _rasterization(*, means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, eps2d, packed, absgrad):
+def _rasterization(
+    *, means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, eps2d, packed, absgrad, rasterize_mode
+):
     """gsplat.rasterization for one camera and post-activation colours of any number of channels, by way of the torch reference."""
     from p2gs.render.torch_ref import rasterize_torch
 
@@ -18,7 +20,7 @@ def _rasterization(*, means, quats, scales, opacities, colors, viewmats, Ks, wid
     n = means.shape[0]
     inputs = base.RenderInputs(
         means, quats, scales, opacities, torch.zeros(n, 1, 3), viewmats[0], Ks[0], width, height, 0, colors, None, False, 0.0,
-        near_plane, eps2d, False, False,
+        near_plane, eps2d, {"classic": False, "antialiased": True}[rasterize_mode], False, False,
     )  # fmt: skip
     out = rasterize_torch(inputs)
     # means2d takes part in the graph, so that its hook runs; gsplat fills `absgrad` before it does
@@ -37,7 +39,7 @@ def test_same_as_the_reference(monkeypatch):
     backend = importlib.import_module("p2gs.render.gsplat")
     base.RASTERIZERS._items["stand_in"] = backend.through_gsplat
 
-    for options in ({}, {"depth_sq": True, "depth_ref": 2.5}):
+    for options in ({}, {"depth_sq": True, "depth_ref": 2.5}, {"eps2d": 0.3, "antialias": False}):
         w = world(60, 40, 30, features=3, background="image", seed=4)
         w.tensors["means"][5, 1] = torch.nan
         w.tensors["sh"][6, 2, 0] = torch.inf

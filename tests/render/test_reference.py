@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 from worlds import world
 
@@ -37,8 +38,9 @@ def test_two_gaussians_by_hand():
     means, quats, scales, opacities, sh, colours, K = _two_on_the_axis()
     background = torch.tensor([0.0, 1, 0], dtype=torch.float64)
     out = rasterize(
-        means, quats, scales, opacities, sh, torch.eye(4), K, 1, 1, background=background, depth_sq=True, depth_ref=1.0, backend="torch_ref"
-    )
+        means, quats, scales, opacities, sh, torch.eye(4), K, 1, 1,
+        background=background, depth_sq=True, depth_ref=1.0, antialias=False, backend="torch_ref",
+    )  # fmt: skip
     near, far = 0.4, 0.6 * 0.7
     assert torch.allclose(out.colour[0, 0], near * colours[1] + far * colours[0] + (1 - near - far) * background)
     assert math.isclose(out.alpha.item(), near + far, rel_tol=1e-12)
@@ -50,11 +52,27 @@ def test_two_gaussians_by_hand():
 def test_footprint_by_hand():
     """One isotropic Gaussian: alpha falls off as exp(-r^2 / 2 (f^2 s^2 / z^2 + eps2d)) and ends at 1/255."""
     means, quats, scales, opacities, sh, _, K = (t[1:] if t.shape[0] == 2 else t for t in _two_on_the_axis())
-    out = rasterize(means, quats, scales, opacities, sh, torch.eye(4), K, 30, 1, backend="torch_ref")
+    out = rasterize(means, quats, scales, opacities, sh, torch.eye(4), K, 30, 1, eps2d=0.3, antialias=False, backend="torch_ref")
     variance = (100 * 0.05 / 2) ** 2 + 0.3
     alpha = 0.4 * torch.exp(-0.5 * torch.arange(30, dtype=torch.float64) ** 2 / variance)
     assert torch.allclose(out.alpha[0], torch.where(alpha >= 1 / 255, alpha, 0.0), rtol=1e-12)
     assert (out.alpha[0] == 0).any() and out.radii.item() == math.ceil(math.sqrt(2 * variance * math.log(0.4 * 255)))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.8, 1.3])
+def test_antialiased_area(tilt):
+    """Opacity falls as the area grows: a disc covers what its projection covers, also when it is seen almost edge-on."""
+    quats = torch.tensor([[math.cos(tilt / 2), math.sin(tilt / 2), 0, 0]], dtype=torch.float64)
+    K = torch.tensor([[200.0, 0, 50.5], [0, 200, 50.5], [0, 0, 1]])
+    means, scales, opacity = torch.tensor([[0.0, 0, 4]]).double(), torch.tensor([[0.01, 0.01, 1e-5]]).double(), torch.tensor([0.9]).double()
+    out = [
+        rasterize(means, quats, scales, opacity, torch.zeros(1, 1, 3), torch.eye(4), K, 101, 101, backend="torch_ref", **options)
+        for options in ({}, {"eps2d": 0.3}, {"eps2d": 0.3, "antialias": False})
+    ]
+    true = 0.9 * 2 * math.pi * (200 * 0.01 / 4) ** 2 * math.cos(tilt)
+    sums = [o.alpha.sum().item() for o in out]
+    assert sums[0] == pytest.approx(true, rel=0.25) and sums[1] == pytest.approx(true, rel=0.15)  # sampled at pixel centres, cut off at 1/255
+    assert sums[2] > 1.5 * true / max(math.cos(tilt), 0.3)
 
 
 def test_scaled_and_cropped_cameras():
