@@ -73,11 +73,10 @@ class Planar(Loss):
 
 @register_loss("flat")
 class Flat(Loss):
-    """Mean over Gaussians of their shortest standard deviation, in the scene's units (PGSR, Chen et al. 2024, arXiv:2406.06521, eq. 7). Not in
-    the paper.
+    """Mean over Gaussians of their shortest standard deviation (Chen et al. 2024, PGSR, arXiv:2406.06521). Not in the paper.
 
-    Seen edge-on a surface is a stack of Gaussians as thick as they are: their faint rims add up, the outline grows by two or three standard
-    deviations, and training puts it right by pulling the surface inward, 0.002 to 0.004 units of an object of unit size. Flat ones have no rims.
+    Seen edge-on a surface is a stack of Gaussians as thick as they are: their faint rims add up, the outline grows by two or three
+    standard deviations, and training puts that right by pulling the surface inward. Flat ones have no rims.
     """
 
     weight: float = 1.0

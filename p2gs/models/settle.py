@@ -53,11 +53,11 @@ def reconsider(
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``); with each every surfel chooses its
     part anew and the states are re-rendered. A part may also be two of nearly one motion (``splits``), as it is or with a doubtful part
     left out: what moved by another amount than its neighbour is easily explained by a wild motion. Two whose motions hardly differ save
-    little, and so do errors of one state: they are held to less, but both directions must tell the difference alike. The best of each kind is refined; the
-    image loss must fall by ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part. Junk lowers the loss by as
-    much as a small door does: with labels chosen anew, a further part's surface must also be found in both states (discovery's confidence
-    at least ``missing_confidence``) and the photographs must hold its joint where it is (``JointEvidence.confidence`` at least
-    ``missing_evidence``).  Returns the motions and what was tried.
+    little, and so do errors of one state: they are held to less, but both directions must tell the difference alike. The best of each
+    kind is refined; the image loss must fall by ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part. Junk
+    lowers the loss by as much as a small door does: with labels chosen anew, a further part's surface must also be found in both states
+    (discovery's confidence at least ``missing_confidence``) and the photographs must hold its joint where it is
+    (``JointEvidence.confidence`` at least ``missing_evidence``).  Returns the motions and what was tried.
     """
     options = {"backend": backend, "device": device}
     level, log = config.coarse.levels[-1], []

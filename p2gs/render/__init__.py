@@ -83,9 +83,9 @@ def rasterize(
     sh [N, B, 3] with B = 1, 4, 9 or 16; viewmat [4, 4] world -> camera, K [3, 3] in pixels (see ``types``), both without gradient.
     sh_degree: use only the bands up to it.  features [N, F], F <= 16: composited like colour, over nothing.
     background [3] or [H, W, 3] (default black).  depth_sq: also accumulate (z - depth_ref)^2.
-    near: Gaussians nearer than this (scene units) are culled.  eps2d: variance in pixels^2 added to every projected Gaussian, the pixel's
-    own extent; antialias: its opacity falls by as much as its area grows by that (Yu et al. 2024, Mip-Splatting, arXiv:2311.16493), so that a
-    surface seen edge-on is as thin as it is. 3DGS adds 0.3 and does not.
+    near: Gaussians nearer than this (scene units) are culled.  eps2d: variance in pixels^2 added to every projected
+    Gaussian, the pixel's own extent.  antialias: its opacity falls by as much as its area grows by that (Yu et al. 2024, Mip-Splatting,
+    arXiv:2311.16493), so that a surface seen edge-on is as thin as it is. 3DGS adds 0.3 and leaves opacities alone.
     absgrad: the backward pass fills ``means2d_abs_grad`` [N] = length of (sum |dL/dx|, sum |dL/dy|) over pixels, pixel units
     (Ye et al. 2024, arXiv:2404.10484).  median_depth: also give the depth where transmittance passes one half; by default only
     when no gradient is recorded.  backend: a name in ``RASTERIZERS`` or "auto" (cpu or gsplat by device, else torch_ref).
@@ -130,7 +130,8 @@ def rasterize_stored(
     if sh_rest is not None and sh_rest.shape[1] == 0:
         sh_rest = None
     name = _auto(means) if backend == "auto" else backend
-    options = {"depth_sq": False, "depth_ref": 0.0, "near": 0.01, "eps2d": EPS2D, "antialias": True, "absgrad": False, "median_depth": None, **options}
+    options = {"depth_sq": False, "depth_ref": 0.0, "near": 0.01, "absgrad": False, "median_depth": None, **options}
+    options = {"eps2d": EPS2D, "antialias": True, **options}
     if name != "cpu":
         sh = sh if sh_rest is None else torch.cat([sh, sh_rest], 1)
         activated = (means, quats, log_scales.exp(), torch.sigmoid(opacity_logits), sh)

@@ -87,6 +87,15 @@ def test_opacity_pushes_away_from_one_half():
     torch.testing.assert_close(LOSSES["opacity"]()(replace(inputs, gaussians=inputs.gaussians[order])), LOSSES["opacity"]()(inputs))
 
 
+def test_flat_shrinks_the_shortest_axis_alone():
+    scales = torch.tensor([[0.3, 0.1, 0.2], [0.4, 0.5, 0.05]], dtype=F64)
+    logs = scales.log().requires_grad_()
+    value = LOSSES["flat"]()(LossInputs(0, 100, replace(make_inputs().gaussians[torch.arange(2)], log_scales=logs)))
+    assert value.item() == pytest.approx((0.1 + 0.05) / 2)
+    value.backward()
+    torch.testing.assert_close(logs.grad, torch.tensor([[0, 0.05, 0], [0, 0, 0.025]], dtype=F64))
+
+
 def test_depth_is_logarithmic_over_what_is_known():
     inputs = make_inputs()
     terms = []

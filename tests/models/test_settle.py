@@ -9,7 +9,7 @@ from tiny import hinge, slide
 
 from p2gs.models import settle
 from p2gs.models.handover import PartMotions
-from p2gs.models.part_motions import PartMotionsConfig
+from p2gs.models.part_motions import PartMotionsConfig, _contenders
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.ops import se3
 
@@ -97,3 +97,47 @@ def test_a_part_of_which_one_state_shows_nothing_is_dropped(monkeypatch):
     assert same is kept and gone == []
     none, gone = settle.drop_unfounded(None, states, two, views, PartMotionsConfig(min_confidence=0.0), [None, None], **options)
     assert none is two and gone == []
+
+
+def _explained(*motions):
+    """What ``find_part_motions`` knows of an explanation, labels aside."""
+    transforms = torch.stack([T for _, T in motions]) if motions else torch.zeros(0, 4, 4).double()
+    return PartMotions([kind for kind, _ in motions], transforms, torch.ones(len(motions)), [], [])
+
+
+def test_what_is_nearly_as_good_and_says_something_else_goes_on():
+    near = slide()
+    near[:3, 3] += 0.01
+    a, b, same = ("prismatic", slide()), ("revolute", hinge()), ("prismatic", near)
+    config = PartMotionsConfig(contenders=2, contend=0.1)
+
+    def numbers(*ranked, config=config):
+        return [n for _, n, _ in _contenders([(rank, n, _explained(*m)) for n, (rank, m) in enumerate(ranked)], config)]
+
+    assert numbers((1.05, [a]), (1.0, [b])) == [1, 0]
+    assert numbers((1.0, [a]), (1.2, [b])) == [0]  # too much worse
+    assert numbers((1.0, [a]), (1.02, [same]), (1.05, [a, b])) == [0, 2]  # the second says the same
+    assert numbers((1.0, [a, b]), (1.0, [b, same])) == [0]  # in another order
+    assert numbers((1.0, [a]), (1.01, [b]), (1.02, [])) == [0, 1]  # two at most
+    assert numbers((1.0, [a]), (1.01, [b]), config=PartMotionsConfig(contenders=1)) == [0]
+    assert numbers((1.0, [])) == [0]
+
+
+def test_halves_that_the_directions_tell_apart_differently_are_no_parts(monkeypatch):
+    """However much of the image loss they save."""
+    states, labels, views = two_states(slide())
+    margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.9)
+    off = slide()
+    off[:3, 3] += 0.02
+    motions = PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], margins)
+    halves = PartMotions(["prismatic"] * 2, torch.stack([slide(), slide()]), torch.ones(2), [labels, labels], margins)
+    monkeypatch.setattr(settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types)))
+    monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
+    monkeypatch.setattr(settle, "instead_of", lambda *a: [])
+    monkeypatch.setattr(settle, "splits", lambda *a, steps=None, **k: [(0, halves)] if steps else [])
+    monkeypatch.setattr(settle, "_evidence", lambda *a: [sure] * 2)
+    config = PartMotionsConfig(coarse=COARSE, split_penalty=-1.0, missing_penalty=-1.0)
+    for told, parts in ((0.1, 2), (0.9, 1)):
+        monkeypatch.setattr(settle, "ways_disagree", lambda *a, told=told, **k: told)
+        found, log = settle.reconsider(None, states, motions, views, config, [None, None], 2, seed=0, backend="auto")
+        assert len(found) == parts and any(entry.get("ways") == told for entry in log)

@@ -74,7 +74,8 @@ def test_needles_and_specks(isa):
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("eps2d", [0.1, 0.3, 2.0])
 def test_pixels_extent(isa, antialias, eps2d):
-    assert_same_as_reference(world(400, scale=(0.002, 0.03), seed=17, features=2), eps2d=eps2d, antialias=antialias, depth_sq=True, depth_ref=2.9)
+    options = {"eps2d": eps2d, "antialias": antialias, "depth_sq": True, "depth_ref": 2.9}
+    assert_same_as_reference(world(400, scale=(0.002, 0.03), seed=17, features=2), **options)
 
 
 def test_at_the_border_and_behind(isa):

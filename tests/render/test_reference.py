@@ -71,7 +71,8 @@ def test_antialiased_area(tilt):
     ]
     true = 0.9 * 2 * math.pi * (200 * 0.01 / 4) ** 2 * math.cos(tilt)
     sums = [o.alpha.sum().item() for o in out]
-    assert sums[0] == pytest.approx(true, rel=0.25) and sums[1] == pytest.approx(true, rel=0.15)  # sampled at pixel centres, cut off at 1/255
+    # sampled at pixel centres, cut off at 1/255
+    assert sums[0] == pytest.approx(true, rel=0.25) and sums[1] == pytest.approx(true, rel=0.15)
     assert sums[2] > 1.5 * true / max(math.cos(tilt), 0.3)
 
 
