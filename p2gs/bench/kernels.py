@@ -83,8 +83,7 @@ def _leaves(n: int, px: int, device: str, dtype: torch.dtype = torch.float32):
 
 
 def _render(leaves: list[Tensor], camera, backend: str):
-    # splats as wide as 3DGS draws them: more work than p2gs's own, and what others' figures are for
-    return rasterize(*leaves, camera.viewmat, camera.K, camera.width, camera.height, eps2d=0.3, antialias=False, backend=backend)
+    return rasterize(*leaves, camera.viewmat, camera.K, camera.width, camera.height, backend=backend)
 
 
 def _time(n: int, px: int, threads: int, device: str, backend: str, seconds: float, reference: bool) -> Row:

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from p2gs.ops import so3
 from p2gs.render import rasterize
+from p2gs.render.base import ANTIALIAS, EPS2D
 from p2gs.types import Camera, GaussianTensors
 
 
-def footprint(g: GaussianTensors, camera: Camera) -> Tensor:
+def footprint(g: GaussianTensors, camera: Camera, eps2d: float = EPS2D, antialias: bool = ANTIALIAS) -> Tensor:
     """What each Gaussian alone would add to the image's alpha, summed over pixels: opacity * 2 pi sqrt(det of its 2D covariance), [N].
 
-    0 for what lies behind the camera. The covariance is EWA's: a pixel's own extent widens a Gaussian and takes as much of its opacity.
+    0 for what lies behind the camera. The covariance is the rasterizer's: EWA, ``eps2d`` pixels^2 added unless opacities fall by as much.
     """
     W, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     p = g.means @ W.T + t
@@ -28,7 +29,10 @@ def footprint(g: GaussianTensors, camera: Camera) -> Tensor:
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * p[:, 0] / z**2, zero, fy / z, -fy * p[:, 1] / z**2], -1).reshape(-1, 2, 3)
     P = J @ W @ so3.quat_to_matrix(so3.quat_normalize(g.quats)) * g.log_scales.exp()[:, None, :]
-    area = 2 * math.pi * torch.linalg.cross(P[:, 0], P[:, 1]).norm(dim=1) * torch.sigmoid(g.opacity_logits)
+    cov = P @ P.transpose(1, 2)
+    added = 0.0 if antialias else eps2d
+    det = (cov[:, 0, 0] + added) * (cov[:, 1, 1] + added) - cov[:, 0, 1] ** 2
+    area = 2 * math.pi * det.clamp_min(0).sqrt() * torch.sigmoid(g.opacity_logits)
     return torch.where(p[:, 2] > 0.01, area, torch.zeros_like(area))
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from p2gs.native import native, warn_missing_once
 from p2gs.registry import suggest
-from p2gs.render.base import EPS2D, RASTERIZERS, Rasterizer, RenderInputs, check
+from p2gs.render.base import ANTIALIAS, EPS2D, RASTERIZERS, Rasterizer, RenderInputs, check
 from p2gs.types import RenderOutput, UserError
 
 __all__ = ["RASTERIZERS", "RenderInputs", "find_rasterizer", "rasterize", "rasterize_stored"]
@@ -72,7 +72,7 @@ def rasterize(
     depth_ref: float = 0.0,
     near: float = 0.01,
     eps2d: float = EPS2D,
-    antialias: bool = True,
+    antialias: bool = ANTIALIAS,
     absgrad: bool = False,
     median_depth: Optional[bool] = None,
     backend: str = "auto",
@@ -85,7 +85,7 @@ def rasterize(
     background [3] or [H, W, 3] (default black).  depth_sq: also accumulate (z - depth_ref)^2.
     near: Gaussians nearer than this (scene units) are culled.  eps2d: variance in pixels^2 added to every projected
     Gaussian, the pixel's own extent.  antialias: its opacity falls by as much as its area grows by that (Yu et al. 2024, Mip-Splatting,
-    arXiv:2311.16493), so that a surface seen edge-on is as thin as it is. 3DGS adds 0.3 and leaves opacities alone.
+    arXiv:2311.16493), so that a surface seen edge-on is as thin as it is.
     absgrad: the backward pass fills ``means2d_abs_grad`` [N] = length of (sum |dL/dx|, sum |dL/dy|) over pixels, pixel units
     (Ye et al. 2024, arXiv:2404.10484).  median_depth: also give the depth where transmittance passes one half; by default only
     when no gradient is recorded.  backend: a name in ``RASTERIZERS`` or "auto" (cpu or gsplat by device, else torch_ref).
@@ -131,7 +131,7 @@ def rasterize_stored(
         sh_rest = None
     name = _auto(means) if backend == "auto" else backend
     options = {"depth_sq": False, "depth_ref": 0.0, "near": 0.01, "absgrad": False, "median_depth": None, **options}
-    options = {"eps2d": EPS2D, "antialias": True, **options}
+    options = {"eps2d": EPS2D, "antialias": ANTIALIAS, **options}
     if name != "cpu":
         sh = sh if sh_rest is None else torch.cat([sh, sh_rest], 1)
         activated = (means, quats, log_scales.exp(), torch.sigmoid(opacity_logits), sh)

@@ -16,7 +16,7 @@ ALPHA_MIN = 1 / 255  # a Gaussian fainter than this at a pixel is skipped there
 ALPHA_MAX = 0.99  # and none is more opaque
 T_STOP = 1e-4  # a pixel is finished before its transmittance would fall to this
 FAR = 1e10
-EPS2D = 0.1  # variance of a pixel, pixels^2: a box has 1/12, renderers' filters a little more
+EPS2D, ANTIALIAS = 0.3, False  # what 3DGS has; 0.1 and True draw edges better (docs/measured.md), but part discovery is not up to it yet
 MAX_FEATURES = 16
 
 

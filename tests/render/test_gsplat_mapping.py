@@ -39,7 +39,7 @@ def test_same_as_the_reference(monkeypatch):
     backend = importlib.import_module("p2gs.render.gsplat")
     base.RASTERIZERS._items["stand_in"] = backend.through_gsplat
 
-    for options in ({}, {"depth_sq": True, "depth_ref": 2.5}, {"eps2d": 0.3, "antialias": False}):
+    for options in ({}, {"depth_sq": True, "depth_ref": 2.5}, {"eps2d": 0.1, "antialias": True}):
         w = world(60, 40, 30, features=3, background="image", seed=4)
         w.tensors["means"][5, 1] = torch.nan
         w.tensors["sh"][6, 2, 0] = torch.inf

@@ -10,13 +10,14 @@ from p2gs.ops.sh import rgb_to_dc
 from p2gs.render import rasterize
 
 
-def test_gradcheck():
+@pytest.mark.parametrize("antialias", [False, True])
+def test_gradcheck(antialias):
     w = world(4, 6, 5, bases=4, features=2, background="image", opacity=(0.3, 0.9), scale=(0.3, 0.6), spread=0.3, seed=1)
     names = [k for k, t in w.tensors.items() if t is not None]
 
     def f(*tensors):
         given = dict(zip(names, tensors, strict=True))
-        out = rasterize(viewmat=w.viewmat, K=w.K, width=6, height=5, depth_sq=True, depth_ref=2.0, backend="torch_ref", **given)
+        out = rasterize(viewmat=w.viewmat, K=w.K, width=6, height=5, depth_sq=True, depth_ref=2.0, antialias=antialias, backend="torch_ref", **given)
         return out.colour, out.alpha, out.depth, out.depth_sq, out.features
 
     # a step so small that no alpha crosses 1/255 on the way
@@ -38,9 +39,8 @@ def test_two_gaussians_by_hand():
     means, quats, scales, opacities, sh, colours, K = _two_on_the_axis()
     background = torch.tensor([0.0, 1, 0], dtype=torch.float64)
     out = rasterize(
-        means, quats, scales, opacities, sh, torch.eye(4), K, 1, 1,
-        background=background, depth_sq=True, depth_ref=1.0, antialias=False, backend="torch_ref",
-    )  # fmt: skip
+        means, quats, scales, opacities, sh, torch.eye(4), K, 1, 1, background=background, depth_sq=True, depth_ref=1.0, backend="torch_ref"
+    )
     near, far = 0.4, 0.6 * 0.7
     assert torch.allclose(out.colour[0, 0], near * colours[1] + far * colours[0] + (1 - near - far) * background)
     assert math.isclose(out.alpha.item(), near + far, rel_tol=1e-12)
@@ -52,7 +52,7 @@ def test_two_gaussians_by_hand():
 def test_footprint_by_hand():
     """One isotropic Gaussian: alpha falls off as exp(-r^2 / 2 (f^2 s^2 / z^2 + eps2d)) and ends at 1/255."""
     means, quats, scales, opacities, sh, _, K = (t[1:] if t.shape[0] == 2 else t for t in _two_on_the_axis())
-    out = rasterize(means, quats, scales, opacities, sh, torch.eye(4), K, 30, 1, eps2d=0.3, antialias=False, backend="torch_ref")
+    out = rasterize(means, quats, scales, opacities, sh, torch.eye(4), K, 30, 1, backend="torch_ref")
     variance = (100 * 0.05 / 2) ** 2 + 0.3
     alpha = 0.4 * torch.exp(-0.5 * torch.arange(30, dtype=torch.float64) ** 2 / variance)
     assert torch.allclose(out.alpha[0], torch.where(alpha >= 1 / 255, alpha, 0.0), rtol=1e-12)
@@ -67,7 +67,7 @@ def test_antialiased_area(tilt):
     means, scales, opacity = torch.tensor([[0.0, 0, 4]]).double(), torch.tensor([[0.01, 0.01, 1e-5]]).double(), torch.tensor([0.9]).double()
     out = [
         rasterize(means, quats, scales, opacity, torch.zeros(1, 1, 3), torch.eye(4), K, 101, 101, backend="torch_ref", **options)
-        for options in ({}, {"eps2d": 0.3}, {"eps2d": 0.3, "antialias": False})
+        for options in ({"eps2d": 0.1, "antialias": True}, {"eps2d": 0.3, "antialias": True}, {"eps2d": 0.3})
     ]
     true = 0.9 * 2 * math.pi * (200 * 0.01 / 4) ** 2 * math.cos(tilt)
     sums = [o.alpha.sum().item() for o in out]
