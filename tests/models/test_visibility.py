@@ -28,7 +28,8 @@ def ring(size=64, count=6):
 def test_footprint_is_what_one_gaussian_adds_to_alpha(pixel):
     g = gaussians(torch.tensor([[0.1, -0.2, 0.1]]), torch.tensor([0.08]), 0.7)
     for camera in ring():
-        out = rasterize(g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh, camera.viewmat, camera.K, 64, 64, **pixel)
+        activated = (g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh)
+        out = rasterize(*activated, camera.viewmat, camera.K, 64, 64, **pixel)
         assert float(footprint(g, camera, **pixel)[0]) == pytest.approx(float(out.alpha.sum()), rel=0.03)
 
 

@@ -17,7 +17,8 @@ def test_gradcheck(antialias):
 
     def f(*tensors):
         given = dict(zip(names, tensors, strict=True))
-        out = rasterize(viewmat=w.viewmat, K=w.K, width=6, height=5, depth_sq=True, depth_ref=2.0, antialias=antialias, backend="torch_ref", **given)
+        options = {"depth_sq": True, "depth_ref": 2.0, "antialias": antialias, "backend": "torch_ref"}
+        out = rasterize(viewmat=w.viewmat, K=w.K, width=6, height=5, **options, **given)
         return out.colour, out.alpha, out.depth, out.depth_sq, out.features
 
     # a step so small that no alpha crosses 1/255 on the way
