@@ -121,12 +121,14 @@ def _discovery(d: dict) -> list[str]:
         out.append(table(["state", "moved", "static", "unknown", "moved, but in no part"], rows))
     found = d["discovery"]
     if found is not None:
-        rows = []
+        rows, contests = [], found.get("contests", [])
         for i, e in enumerate(found["explanations"]):
             tried = e.get("reductions", [])
             gone = ", ".join(f"{r['change']} {r['type']} ({r['cost_with']:.4f} to {r['cost_without']:.4f})" for r in tried)
-            mark = "chosen" if i == found["chosen"] else ""
+            ended = [c for c in contests if c["explanation"] == i and len(contests) > 1]
+            mark = "chosen" if i == found["chosen"] else "reconsidered" if ended else ""
             rows.append([str(i + 1), f"{e['cost']:.4f}", mark, f"{', '.join(e.get('types', []))}{'; ' * bool(gone)}{gone}"])
+            rows += [["", f"{c['rank']:.4f}", "where that led, with a price on each part", ", ".join(c["types"])] for c in ended]
         out.append(table(["explanation", "image loss", "", "parts; what was dropped or merged (image loss with it, without it)"], rows))
         rows = [[f"{p['part']}", p["type"], _amount(p), f"{p['confidence']:.2f}"] for p in found["parts"]]
         out.append(table(["part of discovery", "type", "start to end", "share explained"], rows))

@@ -118,8 +118,8 @@ void bind_raster(nb::module_& m) {
         .def("forward", &RasterView::forward,
              "addresses (means, quats, scales, opacities, sh, features, background, colour, alpha, depth, depth_sq, median, features out, "
              "radii, sh_rest; 0 = none), n, sh_bases, sh_degree, num_features, viewmat (16 floats), (fx, fy, cx, cy), width, height, near, eps2d, "
-             "depth_ref, antialias, background is an image, stored (scales are logarithms, opacities logits), backward will follow, threads. With sh_rest, sh is "
-             "the constant band alone.")
+             "depth_ref, antialias, background is an image, stored (scales are logarithms, opacities logits), backward will follow, threads. "
+             "With sh_rest, sh is the constant band alone.")
         .def("backward", &RasterView::backward,
              "addresses (gradients by colour, alpha, depth, depth_sq, features; gradients to means, quats, scales, opacities, sh, features, "
              "abs_grad, sh_rest; 0 = none), threads");

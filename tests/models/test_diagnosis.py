@@ -8,7 +8,7 @@ import torch
 from test_finish import two_states
 from tiny import hinge
 
-from p2gs.export.diagnostics_page import write_diagnosis
+from p2gs.export.diagnostics_page import page, write_diagnosis
 from p2gs.models.diagnosis import StageResults, diagnose, plain, reconstruction
 from p2gs.models.finish import FinishConfig, finish
 from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions
@@ -26,6 +26,7 @@ def small_run(found=None, polish_steps=0):
     n = len(labels)
     told = {
         "explanation": 0,
+        "contests": [{"explanation": 0, "types": ["revolute"], "rank": 0.1}],
         "explanations": [{"types": ["revolute"], "cost": 0.1, "rank": 0.1, "reductions": [
             {"change": "drop", "type": "prismatic", "cost_with": 0.1, "cost_without": 0.1001, "allowed": 0.1006}]}],
         "evidence": [labels.to(torch.int8)] * 2,
@@ -133,6 +134,16 @@ def test_both_files_are_the_same_when_written_again(tmp_path):
     assert d["format"] == "p2gs-diagnostics/1" and set(d["limits"]) == set(LIMITS) and d["losses"] == {}
     assert page.count("data:image/png;base64,") == 4 and "http" not in page
     assert all(f'id="{stage}"' in page for stage in STAGES)
+
+
+def test_the_page_tells_where_reconsidered_explanations_led(tmp_path):
+    stages, twin, views = small_run()
+    d = write_diagnosis(tmp_path, stages, twin, views, min_margin=0.1)
+    assert d["discovery"]["contests"][0]["rank"] == 0.1 and "where that led" not in (tmp_path / "diagnostics.html").read_text()
+    d["discovery"]["explanations"].append({"types": ["revolute"], "cost": 0.12})
+    d["discovery"]["contests"].append({"explanation": 1, "types": ["prismatic", "revolute"], "rank": 0.0987})
+    html = page(d, [], "run")
+    assert html.count("where that led") == 2 and "0.0987" in html and "prismatic, revolute" in html
 
 
 def test_without_discovery_and_without_parts(tmp_path):
