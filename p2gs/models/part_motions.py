@@ -30,7 +30,8 @@ class PartMotionsConfig:
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
     candidates: how many complete explanations are compared by re-rendering; of more, those that look best after ``look_steps`` of
     refinement at the smallest size.  contenders: how many of these go on through all that follows, up to ``reconsider``, where they differ
-    and their image loss is within the share ``contend`` of the best: a wrong start may lead nowhere, and a worse one to the truth.
+    and their image loss is within the share ``contend`` of the best: a wrong start may lead nowhere, and a worse one to the truth. It
+    must then win by ``contend_win``: by less, junk wins too.
     coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
     freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: the same for a further part.
@@ -53,6 +54,7 @@ class PartMotionsConfig:
     candidates: int = 3
     contenders: int = 2
     contend: float = 0.1
+    contend_win: float = 0.05
     look_steps: int = 40
     compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
@@ -139,7 +141,7 @@ def find_part_motions(
         refined.append((rank, number, motions))
     contenders = _contenders(refined, config)
     limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
-    best, contests = None, []
+    ends, contests = [], []
     for _, number, motions in contenders:
         motions = settle_types(states, motions, views, config, stacks, **options)
         changed: list[dict] = []
@@ -150,9 +152,8 @@ def find_part_motions(
             motions = simplify(states, motions, views, config, backend=backend, device=device, log=changed)
         rank = _rank(explanation_cost(states, motions, views, level, backend, device), motions, config)
         contests.append({"explanation": number, "types": motions.types, "rank": rank})
-        if best is None or rank < best[0]:
-            best = (rank, number, motions, shifted, changed)
-    _, number, motions, shifted, changed = best
+        ends.append((number, motions, shifted, changed))
+    number, motions, shifted, changed = ends[_winner([c["rank"] for c in contests], config.contend_win)]
     say("settling labels and motions")
     motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
     motions, unfounded = drop_unfounded(found, states, motions, views, config, stacks, **options)
@@ -188,6 +189,12 @@ def _contenders(refined: list[tuple[float, int, PartMotions]], config: PartMotio
         if not out or (close and not any(_same(motions, other, config.same_motion) for _, _, other in out)):
             out.append((rank, number, motions))
     return out[: max(config.contenders, 1)]
+
+
+def _winner(ranks: list[float], margin: float) -> int:
+    """The lowest of ``ranks``, if it is lower than the first by more than the share ``margin``; else the first."""
+    best = min(range(len(ranks)), key=ranks.__getitem__)
+    return best if ranks[best] < ranks[0] * (1 - margin) else 0
 
 
 def _same(a: PartMotions, b: PartMotions, reach: float) -> bool:

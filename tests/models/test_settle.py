@@ -9,7 +9,7 @@ from tiny import hinge, slide
 
 from p2gs.models import settle
 from p2gs.models.handover import PartMotions
-from p2gs.models.part_motions import PartMotionsConfig, _contenders
+from p2gs.models.part_motions import PartMotionsConfig, _contenders, _winner
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.ops import se3
 
@@ -121,6 +121,13 @@ def test_what_is_nearly_as_good_and_says_something_else_goes_on():
     assert numbers((1.0, [a]), (1.01, [b]), (1.02, [])) == [0, 1]  # two at most
     assert numbers((1.0, [a]), (1.01, [b]), config=PartMotionsConfig(contenders=1)) == [0]
     assert numbers((1.0, [])) == [0]
+
+
+def test_a_contender_must_win_clearly():
+    assert _winner([1.0], 0.05) == 0
+    assert _winner([1.0, 0.96], 0.05) == 0
+    assert _winner([1.0, 0.94, 0.93], 0.05) == 2
+    assert _winner([1.0, 1.2], 0.05) == 0
 
 
 def test_halves_that_the_directions_tell_apart_differently_are_no_parts(monkeypatch):
