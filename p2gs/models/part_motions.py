@@ -20,6 +20,7 @@ from p2gs.models.phase import PHASES
 from p2gs.models.refine_motions import explanation_cost, leave_false_minima, refine
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.models.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
+from p2gs.ops import se3
 from p2gs.types import TwoStateScene, UserError
 
 
@@ -202,8 +203,7 @@ def _same(a: PartMotions, b: PartMotions, reach: float) -> bool:
     if len(a) != len(b) or len(a) == 0:
         return len(a) == len(b)
     corners = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)
-    moved = [m.transforms[:, None, :3, :3] @ corners[None, :, :, None] + m.transforms[:, None, :3, 3:] for m in (a, b)]
-    apart = (moved[0][:, None] - moved[1][None]).squeeze(-1).norm(dim=-1).amax(-1)
+    apart = (se3.apply(a.transforms, corners)[:, None] - se3.apply(b.transforms, corners)).norm(dim=-1).amax(-1)
     return bool((apart.amin(1) < reach).all() and (apart.amin(0) < reach).all())
 
 

@@ -130,8 +130,10 @@ def rasterize_stored(
     if sh_rest is not None and sh_rest.shape[1] == 0:
         sh_rest = None
     name = _auto(means) if backend == "auto" else backend
-    options = {"depth_sq": False, "depth_ref": 0.0, "near": 0.01, "absgrad": False, "median_depth": None, **options}
-    options = {"eps2d": EPS2D, "antialias": ANTIALIAS, **options}
+    options = {
+        "depth_sq": False, "depth_ref": 0.0, "near": 0.01, "eps2d": EPS2D, "antialias": ANTIALIAS, "absgrad": False,
+        "median_depth": None, **options,
+    }  # fmt: skip
     if name != "cpu":
         sh = sh if sh_rest is None else torch.cat([sh, sh_rest], 1)
         activated = (means, quats, log_scales.exp(), torch.sigmoid(opacity_logits), sh)
