@@ -26,6 +26,7 @@ from p2gs.models.diagnosis import StageResults
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.finish import finish
+from p2gs.models.openings import open_up
 from p2gs.models.part_motions import find_part_motions
 from p2gs.models.phase import Phase
 from p2gs.models.single_state import SingleStatePhase
@@ -211,14 +212,20 @@ class Pipeline:
         )
 
     def fusion(self, states, motions, section) -> Phase:
-        stacks = None
+        stacks = counted = None
         if motions is not None and len(motions) and section.config.canonical.free_space > 0:
-            found = self.cfg.phases["discovery"].config
+            found, backend = self.cfg.phases["discovery"].config, {"backend": self.cfg.rasterizer, "device": self.device}
             size = (found.evidence_size, found.min_opacity)
             train = [self.scene.select(state=s.state, split="train") for s in states]
-            seen = [gather_evidence(s.gaussians, v, *size, self.cfg.rasterizer, self.device) for s, v in zip(states, train, strict=True)]
+            seen = [gather_evidence(s.gaussians, v, *size, **backend) for s, v in zip(states, train, strict=True)]
             stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in seen]
-        return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, stacks=stacks, **self.common())
+            told = any(v.depth is not None for views in train for v in views)  # where depth is given nothing is open
+            if section.config.openings.may_lose > 0 and not told:
+                states, motions, stacks, counted = open_up(states, motions, self.views, stacks, section.config.openings, **backend)
+                gone, come = (sum(c[k] for c in counted) for k in ("removed", "added"))
+                print(f"canonical_fusion: {gone} Gaussians before openings gave way to {come} on the walls behind them", flush=True)
+        options = {"stacks": stacks, "openings": counted, **self.common()}
+        return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, **options)
 
     def articulate(self, canonical, states, motions, section) -> Phase:
         extent = float((self.scene.box[1] - self.scene.box[0]).norm())

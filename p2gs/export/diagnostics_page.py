@@ -145,6 +145,8 @@ def _fusion(d: dict) -> list[str]:
     rows = [[f"{chip(k)}{k}", f"{n:,}", f"{m:,}"] for k, (n, m) in enumerate(zip(f["gaussians"], f["matched"], strict=True))]
     text = f"canonical time {f['canonical_time']:.3f}; contradicted by free space: "
     text += f"relabelled {_count(f['relabelled'])}, dropped {_count(f['dropped'])}"
+    for state, o in zip(("start", "end"), f.get("openings") or [], strict=False):
+        text += f"; {state}: {o['unconfirmed']:,} that the other state says nothing of, {o['removed']:,} gave way to the walls behind"
     return [table(["part of discovery", "Gaussians", "with a partner in the other state"], rows), f'<p class="soft">{text}</p>']
 
 

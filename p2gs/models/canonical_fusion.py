@@ -12,6 +12,7 @@ from p2gs.models.canonical import CanonicalConfig, carry, fuse, keep_rows, with_
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.free_space import explain_by_free_space, hidden_share
 from p2gs.models.handover import CanonicalGaussians, PartMotions, StateGaussians
+from p2gs.models.openings import OpeningsConfig
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
 from p2gs.models.splats import Splats
@@ -23,13 +24,15 @@ SURFACE = 0.015  # tolerance of rendered depth (internal units): nearer than thi
 
 @dataclass
 class CanonicalFusionConfig(ImageConfig):
-    """Options of fusion and its fine-tuning. steps: paper 5,000. canonical: how the two states are joined."""
+    """Options of fusion and its fine-tuning. steps: paper 5,000. canonical: how the two states are joined. openings: what becomes of
+    surfaces that only one state shows and that nothing fixes in depth."""
 
     steps: int = 500
     levels: list[int] = field(default_factory=lambda: [200, 400])
     level_starts: list[float] = field(default_factory=lambda: [0.0, 0.3])
     rates: SplatRates = field(default_factory=lambda: SplatRates(2e-4, 2e-5, 2e-3, 2e-2, 1e-3, 2.5e-3, 2.5e-4))
     canonical: CanonicalConfig = field(default_factory=CanonicalConfig)
+    openings: OpeningsConfig = field(default_factory=OpeningsConfig)
 
 
 @register_phase("canonical_fusion")
@@ -46,6 +49,7 @@ class CanonicalFusionPhase(ImagePhase):
         motions: PartMotions | None,
         views,
         stacks: list[DepthStack] | None = None,
+        openings: list[dict] | None = None,
         **common,
     ):
         super().__init__(config, losses, views, **common)
@@ -66,7 +70,7 @@ class CanonicalFusionPhase(ImagePhase):
         if fused.offsets is not None:
             carried["offsets"] = fused.offsets
         self.splats = Splats(fused.gaussians, carried=carried)
-        self.counted = fused.diagnostics
+        self.counted = fused.diagnostics if openings is None else {**fused.diagnostics, "openings": openings}
         self.register_buffer("betas", fused.betas)
         self.register_buffer("transforms", transforms)
 

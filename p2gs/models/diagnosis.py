@@ -192,7 +192,7 @@ def labelling(state: StateGaussians, record: FinishRecord, s: int, min_margin: f
 
 
 def fusion(canonical: CanonicalGaussians, time: float) -> dict:
-    """How many Gaussians each state gave a partner, and what free space took away."""
+    """How many Gaussians each state gave a partner, what free space took away, and what became of openings (None: not looked at)."""
     parts = len(canonical.betas)
     count = torch.bincount(canonical.labels, minlength=parts)
     matched = torch.bincount(canonical.labels[canonical.paired], minlength=parts)
@@ -202,6 +202,7 @@ def fusion(canonical: CanonicalGaussians, time: float) -> dict:
         "matched": matched.tolist(),
         "relabelled": canonical.diagnostics.get("relabelled"),
         "dropped": canonical.diagnostics.get("dropped"),
+        "openings": canonical.diagnostics.get("openings"),
     }
 
 

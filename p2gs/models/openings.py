@@ -1,0 +1,310 @@
+"""The room behind an opening: what nothing fixes in depth gives way to the walls behind it, where the photographs allow it.
+
+A dim, noisy inside tells photographs next to nothing of its depth. Training closes the opening with a lid, often as far out as the free
+edges of the open doors, where the other state sees empty space: it cannot be the base's then, is labelled a door's, and swings with it.
+Made things are hollow: unless pictures say otherwise, a view into an opening ends at the inner side of the walls that are known from
+outside. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from p2gs.models.canonical import farthest_points, with_static
+from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.evidence import render_depths
+from p2gs.models.handover import PartMotions, StateGaussians
+from p2gs.models.single_state import render_gaussians
+from p2gs.ops import se3, so3
+from p2gs.ops.knn import knn
+from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
+from p2gs.types import GaussianTensors
+
+SOLID = 0.3  # opacity from which a Gaussian is surface
+TAU = 0.015  # tolerance along a ray, internal units
+SEEN = 0.05  # share of the other state's views that may see a Gaussian which that state does not confirm
+COVER = 5.0  # pixels, all checked views together, that a patch must cover to be judged
+REACH = 0.3  # how far the colours of a wall are carried to where no ray fell on it, internal units
+DEEPEST = 2.0  # how far behind a surface a wall is looked for, internal units
+CHANNELS = 16
+
+
+@dataclass
+class OpeningsConfig:
+    """Options of the room behind openings.
+
+    may_lose: patches give way where the image error over each of them rises to no more than this times what it was; 0 = off. drawers: the
+    same for patches of sliding parts, which have insides that go with them, as doors hardly do.
+    patch: Gaussians a patch. looks, checks: views of a state from which rays are cast, and by which patches are judged; size: their
+    long edge in pixels. apart: surfaces that the other state shows within this are confirmed by it; cell: grid of the walls; wall: their
+    thickness (all internal units).
+    """
+
+    may_lose: float = 1.25
+    drawers: float = 1.0
+    patch: int = 15
+    looks: int = 64
+    checks: int = 12
+    size: int = 200
+    apart: float = 0.035
+    cell: float = 0.02
+    wall: float = 0.03
+
+
+class Walls:
+    """Where the base is known to be solid, as a grid, closed by the sides of the box around everything.
+
+    points [N, 3] on known surfaces; lo, hi [3]: the box.  cell: size of a voxel.
+    """
+
+    def __init__(self, points: Tensor, lo: Tensor, hi: Tensor, cell: float):
+        self.lo, self.cell = lo.double() - 2 * cell, cell
+        self.size = ((hi.double() + 2 * cell - self.lo) / cell).ceil().long() + 1
+        grid = torch.zeros(tuple(self.size.tolist()), dtype=torch.bool)
+        at, inside = self._voxels(points)
+        grid[tuple(at[inside].T)] = True
+        # the gaps between the Gaussians of a wall
+        self.grid = torch.from_numpy(ndimage.binary_closing(grid.numpy())) | grid
+        for axis in range(3):
+            for side in (slice(0, 3), slice(-3, None)):
+                self.grid[(slice(None),) * axis + (side,)] = True
+
+    def _voxels(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        at = ((points.double() - self.lo) / self.cell).floor().long()
+        return at, ((at >= 0) & (at < self.size)).all(-1)
+
+    def meet(self, origins: Tensor, ways: Tensor, chunk: int = 4096) -> Tensor:
+        """Distance [R] at which rays from origins [R, 3] along unit ways [R, 3] meet a wall, from two voxels on; inf where they do not."""
+        steps = torch.arange(2 * self.cell, DEEPEST, self.cell / 2, dtype=torch.float64)
+        out = []
+        for o, w in zip(origins.double().split(chunk), ways.double().split(chunk), strict=True):
+            at, inside = self._voxels(o[:, None] + w[:, None] * steps[:, None])
+            hit = inside & self.grid[tuple(torch.where(inside[..., None], at, 0).unbind(-1))]
+            out.append(torch.where(hit.any(1), steps[hit.to(torch.uint8).argmax(1)], torch.inf))
+        return torch.cat(out) if out else torch.zeros(0, dtype=torch.float64)
+
+
+@dataclass
+class Backdrop:
+    """The inner sides of walls that rays through patches meet. points [P, 3]; of each ray its point [R], colour [R, 3] and patch [R]."""
+
+    points: Tensor
+    where: Tensor
+    colours: Tensor
+    patch: Tensor
+    cell: float
+
+    def paint(self, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean colour [P, 3] of the rays through the patches ``chosen`` [K] bool, and which points one fell on [P]."""
+        rays = chosen[self.patch]
+        count = torch.zeros(len(self.points)).index_add_(0, self.where[rays], torch.ones(int(rays.sum())))
+        colour = torch.zeros(len(self.points), 3).index_add_(0, self.where[rays], self.colours[rays])
+        return colour / count.clamp_min(1)[:, None], count > 0
+
+    def gaussians(self, chosen: Tensor, bases: int) -> tuple[GaussianTensors, Tensor]:
+        """The backdrop as rays through the patches ``chosen`` [K] bool paint it, gaps in the colours beside them; ``bases`` of the SH. And
+        which of its Gaussians a ray fell on."""
+        colour, painted = self.paint(chosen)
+        keep, near = painted.clone(), painted.clone()
+        if painted.any() and not painted.all():
+            distance, index = knn(self.points[painted], self.points[~painted], min(4, int(painted.sum())), False)
+            colour[~painted] = colour[painted][index].mean(1)
+            keep[~painted], near[~painted] = distance[:, 0] < REACH, distance[:, 0] < 3 * self.cell
+        n = int(keep.sum())
+        sh = torch.zeros(n, bases, 3)
+        sh[:, 0] = rgb_to_dc(colour[keep])
+        size = torch.full((n, 3), float(np.log(0.8 * self.cell)))
+        quats = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
+        return GaussianTensors(self.points[keep], quats, size, torch.full((n,), 3.0), sh), near[keep]
+
+
+def unconfirmed(g: GaussianTensors, labels: Tensor, transforms: Tensor, other: GaussianTensors, stack: DepthStack, apart: float) -> Tensor:
+    """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its views see, and farther
+    than ``apart`` from its surfaces.  transforms [K-1, 4, 4] to the other state; stack: its rendered depth."""
+    T = with_static(transforms).to(g.means)[labels]
+    landed = (T[:, :3, :3] * g.means[:, None]).sum(-1) + T[:, :3, 3]
+    free, on, behind = stack.counts(landed, TAU)
+    hidden = (behind > 0) & (free + on <= SEEN * (free + on + behind))
+    solid = torch.sigmoid(other.opacity_logits) > SOLID
+    return hidden & (knn(other.means[solid], landed, 1, False)[0][:, 0] > apart)
+
+
+def over_surface(g: GaussianTensors, count: int = 24, seed: int = 0) -> Tensor:
+    """``count`` points of each Gaussian's body, within 1.7 standard deviations, [N * count, 3]."""
+    z = torch.randn(len(g), count, 3, generator=torch.Generator().manual_seed(seed)).clamp(-1.7, 1.7) * g.log_scales.exp()[:, None]
+    R = so3.quat_to_matrix(so3.quat_normalize(g.quats))
+    return (g.means[:, None] + (R[:, None] * z[:, :, None]).sum(-1)).reshape(-1, 3)
+
+
+def patches(g: GaussianTensors, size: int, rounds: int = 10) -> Tensor:
+    """Patch [N] of each Gaussian: near, alike in facing and colour, ``size`` in the mean (k-means from farthest points)."""
+    R = so3.quat_to_matrix(so3.quat_normalize(g.quats))
+    normal = R[torch.arange(len(g)), :, g.log_scales.argmin(1)]
+    facing = (normal[:, :, None] * normal[:, None]).flatten(1)
+    x = torch.cat([g.means / 0.06, 0.7 * facing, 2 * dc_to_rgb(g.sh[:, 0]).clamp(0, 1)], 1).double()
+    centre = x[farthest_points(g.means, max(1, len(g) // size))]
+    for _ in range(rounds):
+        patch = torch.cdist(x, centre).argmin(1)
+        n = torch.zeros(len(centre), dtype=x.dtype).index_add_(0, patch, torch.ones_like(x[:, 0]))
+        mean = torch.zeros_like(centre).index_add_(0, patch, x) / n.clamp_min(1)[:, None]
+        centre = torch.where(n[:, None] > 0, mean, centre)
+    return patch
+
+
+class OneState:
+    """One state's lids and what is behind them: g its Gaussians; lids [N] bool; slides [N] bool: those of sliding parts."""
+
+    def __init__(self, g: GaussianTensors, lids: Tensor, slides: Tensor, views, config: OpeningsConfig, backend: str, device):
+        self.g, self.views, self.config, self.backend, self.device = g, views, config, backend, device
+        self.rows = lids.nonzero().squeeze(1)
+        self.patch = patches(g[self.rows], config.patch)
+        self.count = int(self.patch.max()) + 1
+        of_slides = torch.zeros(self.count).index_add_(0, self.patch, slides[self.rows].float() - 0.5) > 0
+        self.allowed = torch.where(of_slides, config.drawers, config.may_lose)
+        self.level = min(range(len(views.levels)), key=lambda i: abs(views.levels[i] - config.size))
+
+    def render(self, g: GaussianTensors, camera, background: Tensor, features: Tensor | None = None):
+        features = None if features is None else features.to(self.device)
+        g, camera, background = g.to(self.device), camera.to(self.device), background.to(self.device)
+        return render_gaussians(g, camera, background, features=features, backend=self.backend)
+
+    def backdrop(self, walls: Walls, stacks: list[DepthStack]) -> Backdrop:
+        """Where rays that meet a lid meet the wall behind it, and the photograph's colour there."""
+        lids = torch.zeros(len(self.g), 1)
+        lids[self.rows] = 1
+        places, colours, owners = [torch.zeros(0, 3)], [torch.zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)]
+        for i in self.views.spread(self.config.looks):
+            shot = self.views.get(i, self.level, torch.zeros(3))
+            out = self.render(self.g, shot.camera, torch.zeros(3), lids)
+            depth = (out.expected_depth if out.median_depth is None else out.median_depth).cpu()
+            y, x = ((out.features[..., 0].cpu() > 0.5) & (shot.alpha > 0.9) & (depth > 0)).nonzero().unbind(1)
+            K, W = shot.camera.K.double(), shot.camera.viewmat.double()
+            ray = torch.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], torch.ones(len(x), dtype=torch.float64)], 1)
+            start = (ray * depth[y, x, None].double() - W[:3, 3]) @ W[:3, :3]
+            way = torch.nn.functional.normalize(ray @ W[:3, :3], dim=1)
+            far = walls.meet(start, way)
+            place, found = self.inner_side(start + far.clamp_max(DEEPEST)[:, None] * way, way, stacks)
+            found &= far.isfinite()
+            places.append(place[found])
+            colours.append(shot.image[y, x][found])
+            owners.append(self.patch[knn(self.g.means[self.rows], start[found].float(), 1, False)[1][:, 0]])
+        place, cell = torch.cat(places), self.config.cell
+        voxels, where = torch.unique((place / cell).floor().long(), dim=0, return_inverse=True)
+        n = torch.bincount(where, minlength=len(voxels))
+        points = torch.zeros(len(voxels), 3).index_add_(0, where, place) / n.clamp_min(1)[:, None]
+        return Backdrop(points, where, torch.cat(colours), torch.cat(owners), cell)
+
+    def inner_side(self, met: Tensor, way: Tensor, stacks: list[DepthStack]) -> tuple[Tensor, Tensor]:
+        """Points [R, 3] before the walls that rays along ``way`` [R, 3] ``met`` [R, 3], at the first of a few depths that no view of either
+        state sees; and whether there is one [R]."""
+        place, found = met.float(), torch.zeros(len(met), dtype=torch.bool)
+        for factor in (1.0, 1.5, 2.0, 2.7):
+            tried = (met - factor * self.config.wall * way).float()
+            unseen = torch.ones(len(met), dtype=torch.bool)
+            for stack in stacks:
+                free, on, behind = stack.counts(tried, TAU)
+                unseen &= (free + on == 0) & (behind > 0)
+            place = torch.where((unseen & ~found)[:, None], tried, place)
+            found |= unseen
+        return place, found
+
+    def choose(self, backdrop: Backdrop) -> Tensor:
+        """Patches [K] bool that give way together.
+
+        All go at first; while pixels of some are explained too much worse, the worst stays, or the worse half of those that fail by far.
+        What stayed because of others is tried once more, one by one.
+        """
+        grey = torch.full((3,), 0.5)
+        shots = [self.views.get(i, self.level, grey) for i in self.views.spread(self.config.checks)]
+        onehot = torch.zeros(len(self.g), self.count)
+        onehot[self.rows, self.patch] = 1
+        chunks = onehot.split(CHANNELS, 1)
+        weight = [torch.cat([self.render(self.g, s.camera, grey, c).features.cpu() for c in chunks], -1) for s in shots]
+        pixels = [w.sum(-1) > 0.01 for w in weight]
+        weight = torch.cat([w[p] for w, p in zip(weight, pixels, strict=True)]).T.contiguous()  # [K, pixels that any patch covers]
+
+        def over_patches(g: GaussianTensors) -> Tensor:
+            pictures = [self.render(g, s.camera, grey).colour.cpu() for s in shots]
+            return weight @ torch.cat([(x - s.image).abs().sum(-1)[p] for x, s, p in zip(pictures, shots, pixels, strict=True)])
+
+        cover, was = weight.sum(1), over_patches(self.g)
+
+        def worse(chosen: Tensor) -> Tensor:
+            ratio = over_patches(self.without(chosen, backdrop)[0]) / (was * self.allowed).clamp_min(1e-9)
+            return torch.where(chosen, ratio, 0.0)
+
+        judged = cover > COVER
+        chosen = judged & (torch.bincount(backdrop.patch, minlength=self.count) > 0)
+        while chosen.any():
+            ratio = worse(chosen)
+            if float(ratio.max()) <= 1:
+                break
+            failed = int((ratio > 2).sum())
+            chosen[ratio.topk(max(1, failed // 2)).indices] = False
+        if chosen.any():
+            for k in (judged & ~chosen).nonzero().squeeze(1).tolist():
+                more = chosen.clone()
+                more[k] = True
+                if float(worse(more).max()) <= 1:
+                    chosen = more
+        return chosen
+
+    def without(self, chosen: Tensor, backdrop: Backdrop) -> tuple[GaussianTensors, Tensor]:
+        """The state with the backdrop, at its end, instead of the patches ``chosen`` [K] bool; which of its own it keeps [N] bool."""
+        keep = torch.ones(len(self.g), dtype=torch.bool)
+        keep[self.rows[chosen[self.patch]]] = False
+        return GaussianTensors.cat([self.g[keep], backdrop.gaussians(chosen, self.g.sh.shape[1])[0]]), keep
+
+
+@torch.no_grad()
+def open_up(
+    states: list[StateGaussians],
+    motions: PartMotions,
+    views,
+    stacks: list[DepthStack],
+    config: OpeningsConfig,
+    *,
+    backend: str,
+    device="cpu",
+) -> tuple[list[StateGaussians], PartMotions, list[DepthStack], list[dict]]:
+    """Both states with lids replaced by the inner sides of the walls behind them; the motions with labels of these (the base's), the
+    states' depth, and what was counted, by state.
+
+    views: ``TrainingViews`` by state; stacks: rendered depth of both states.
+    """
+    away = (motions.transforms, se3.inverse(motions.transforms))
+    g = [s.gaussians for s in states]
+    solid = [torch.sigmoid(x.opacity_logits) > SOLID for x in g]
+    lids = [unconfirmed(g[s], motions.labels[s], away[s], g[1 - s], stacks[1 - s], config.apart) for s in (0, 1)]
+    base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
+    slides = torch.tensor([False] + [kind == "prismatic" for kind in motions.types])
+    box = torch.quantile(torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0)
+    walls = Walls(torch.cat([over_surface(x[k]) for x, k in zip(g, base, strict=True)]), box[0], box[1], config.cell)
+    out, labels, margin, depth, counted = list(states), list(motions.labels), list(motions.margin), list(stacks), []
+    for s in (0, 1):
+        counted.append({"unconfirmed": int(lids[s].sum()), "patches": 0, "gave_way": 0, "removed": 0, "added": 0})
+        if not (lids[s] & solid[s]).any():
+            continue
+        state = OneState(g[s], lids[s], slides[motions.labels[s]], views[s], config, backend, device)
+        backdrop = state.backdrop(walls, stacks)
+        chosen = state.choose(backdrop)
+        counted[s] |= {"patches": state.count, "gave_way": int(chosen.sum())}
+        if not chosen.any():
+            continue
+        new, kept = state.without(chosen, backdrop)
+        cameras = stacks[s].cameras
+        depth[s] = DepthStack(*render_depths(new, cameras, backend, device), cameras)
+        seen = torch.ones(len(new), dtype=torch.bool)
+        n = int(kept.sum())
+        seen[n:] = backdrop.gaussians(chosen, 1)[1] | (depth[s].counts(new.means[n:], TAU)[1] > 0)
+        extra = int(seen.sum() - kept.sum())
+        counted[s] |= {"removed": int((~kept).sum()), "added": extra}
+        out[s] = replace(states[s], gaussians=new[seen])
+        labels[s] = torch.cat([labels[s][kept], torch.zeros(extra, dtype=torch.int64)])
+        margin[s] = torch.cat([margin[s][kept], torch.ones(extra)])
+    return out, replace(motions, labels=labels, margin=margin), depth, counted
