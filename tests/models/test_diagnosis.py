@@ -36,7 +36,9 @@ def small_run(found=None, polish_steps=0):
     motions = PartMotions(["revolute"], T, torch.ones(1), [labels, labels], [torch.ones(n)] * 2, told)
     g = states[0].gaussians
     zero = torch.zeros(n, 3)
-    canonical = CanonicalGaussians(g, torch.ones(2).double(), labels, torch.ones(n), torch.ones(n).bool(), zero, zero, None, {"dropped": 3})
+    gave_way = [{"unconfirmed": 11, "patches": 2, "gave_way": 1, "removed": 7, "added": 40}] * 2
+    counted = {"dropped": 3, "openings": gave_way}
+    canonical = CanonicalGaussians(g, torch.ones(2).double(), labels, torch.ones(n), torch.ones(n).bool(), zero, zero, None, counted)
     learned = Articulation(g, torch.nn.functional.one_hot(labels, 2).float(), ["revolute"], T, torch.ones(1), 0.0)
     config = FinishConfig(polish=PolishConfig(steps=polish_steps, levels=[64], level_starts=[0.0], min_margin=0.1), clean_neighbours=0)
     twin, notes, record = finish(learned, states, views, config, Similarity(scale=2.0), seed=0, backend="auto")
@@ -134,6 +136,7 @@ def test_both_files_are_the_same_when_written_again(tmp_path):
     assert d["format"] == "p2gs-diagnostics/1" and set(d["limits"]) == set(LIMITS) and d["losses"] == {}
     assert page.count("data:image/png;base64,") == 4 and "http" not in page
     assert all(f'id="{stage}"' in page for stage in STAGES)
+    assert "start: 11 that the other state says nothing of, 7 gave way to the walls behind" in page
 
 
 def test_the_page_tells_where_reconsidered_explanations_led(tmp_path):
