@@ -23,6 +23,8 @@ from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
 
+UNKNOWN = 4.0  # a state's Gaussian farther than this from the twin, in the median's units, is none of the twin's
+
 
 @dataclass
 class FinishConfig:
@@ -115,14 +117,16 @@ def surviving_slots(learned: Articulation, labels: Tensor, config: FinishConfig)
 
 
 def state_labels(learned: Articulation, labels: Tensor, state: StateGaussians, transforms: Tensor, k: int = 6) -> tuple[Tensor, Tensor]:
-    """Labels of a single-state reconstruction by the twin posed in that state; margin = how far the majority exceeds the rest, 0..1."""
+    """Labels of a single-state reconstruction by the twin posed in that state; margin = how far the majority exceeds the rest, 0..1, or -1
+    for what the twin has nothing near of (lids that gave way to walls): the polish leaves that out."""
     posed = carry(learned.gaussians, labels, se3.screw_at(with_static(transforms), state.state - learned.canonical_time))
     solid = (torch.sigmoid(posed.opacity_logits) > 0.1).nonzero().squeeze(1)
     distance, index = knn(posed.means[solid], state.gaussians.means, k, False)
     spacing = distance[:, 0].median().clamp_min(1e-4)
     weights = torch.exp(-(distance / (2 * spacing)).square()) + 1e-9
     label, share = majority(labels[solid], index, weights, len(transforms) + 1)
-    return label, 2 * share - 1
+    margin = torch.where(distance[:, 0] > UNKNOWN * spacing, -1.0, 2 * share - 1)
+    return label, margin
 
 
 def name_types(types: list[str], transforms: Tensor, below: float) -> list[str]:

@@ -6,7 +6,17 @@ import torch
 from tiny import hinge, photographs, slide, textured_panels
 
 from p2gs.data.views import TrainingViews
-from p2gs.models.finish import FinishConfig, clean_labels, constrain, finish, majority, make_joint, name_types, surviving_slots
+from p2gs.models.finish import (
+    FinishConfig,
+    clean_labels,
+    constrain,
+    finish,
+    majority,
+    make_joint,
+    name_types,
+    state_labels,
+    surviving_slots,
+)
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.part_choices import simplify, without_part
 from p2gs.models.part_motions import PartMotionsConfig
@@ -35,6 +45,16 @@ def test_clean_labels_mends_a_lone_flip():
     flipped[7] = 1 - flipped[7]
     assert torch.equal(clean_labels(g, flipped, 2, 8), labels)
     assert torch.equal(clean_labels(g, flipped, 2, 0), flipped)
+
+
+def test_a_state_takes_the_twins_labels_but_for_what_the_twin_does_not_have():
+    states, labels, _ = two_states(hinge())
+    learned = Articulation(states[0].gaussians, torch.eye(2)[labels], ["revolute"], hinge()[None], torch.ones(1), 0.0)
+    g = states[1].gaussians
+    lid = g[:20].placed(g.means[:20] + torch.tensor([0.0, 0, 5]), g.quats[:20])  # a state's own, nowhere near the twin
+    label, margin = state_labels(learned, labels, StateGaussians(1, GaussianTensors.cat([g, lid])), learned.transforms)
+    assert (margin[-20:] == -1).all() and (margin[:-20] >= 0).float().mean() > 0.99
+    assert (label[:-20] == labels).float().mean() > 0.9
 
 
 def test_joints_say_what_their_transform_does():
