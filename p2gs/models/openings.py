@@ -9,6 +9,7 @@ outside. Not in the paper.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Callable
 
 import numpy as np
 import torch
@@ -39,7 +40,7 @@ class OpeningsConfig:
     """Options of the room behind openings.
 
     may_lose: patches give way where the image error over each of them rises to no more than this times what it was; 0 = off. drawers: the
-    same for patches of sliding parts, which have insides that go with them, as doors hardly do.
+    same for patches of sliding parts, which have insides that go with them, as doors hardly do. rest: the same for patches most of whose neighbours gave way.
     patch: Gaussians a patch. looks, checks: views of a state from which rays are cast, and by which patches are judged; size: their
     long edge in pixels. apart: surfaces that the other state shows within this are confirmed by it; cell: grid of the walls; wall: their
     thickness (all internal units).
@@ -47,6 +48,7 @@ class OpeningsConfig:
 
     may_lose: float = 1.25
     drawers: float = 1.0
+    rest: float = 1.6
     patch: int = 15
     looks: int = 64
     checks: int = 12
@@ -217,7 +219,7 @@ class OneState:
         """Patches [K] bool that give way together.
 
         All go at first; while pixels of some are explained too much worse, the worst stays, or the worse half of those that fail by far.
-        What stayed because of others is tried once more, one by one.
+        What stayed because of others is tried once more, one by one, and at last what is left amid those that went: a lid is one surface.
         """
         grey = torch.full((3,), 0.5)
         shots = [self.views.get(i, self.level, grey) for i in self.views.spread(self.config.checks)]
@@ -246,13 +248,31 @@ class OneState:
                 break
             failed = int((ratio > 2).sum())
             chosen[ratio.topk(max(1, failed // 2)).indices] = False
-        if chosen.any():
-            for k in (judged & ~chosen).nonzero().squeeze(1).tolist():
-                more = chosen.clone()
-                more[k] = True
-                if float(worse(more).max()) <= 1:
-                    chosen = more
+        if not chosen.any():
+            return chosen
+        for k in (judged & ~chosen).nonzero().squeeze(1).tolist():
+            chosen = self.with_one_more(chosen, k, worse)
+        amid = judged & ~chosen & self.surrounded(chosen)
+        self.allowed = torch.where(amid, self.config.rest, self.allowed)
+        for k in amid.nonzero().squeeze(1).tolist():
+            chosen = self.with_one_more(chosen, k, worse)
         return chosen
+
+    @staticmethod
+    def with_one_more(chosen: Tensor, k: int, worse: Callable[[Tensor], Tensor]) -> Tensor:
+        """``chosen`` [K] bool with patch k, if none of them is explained too much worse then."""
+        more = chosen.clone()
+        more[k] = True
+        return more if float(worse(more).max()) <= 1 else chosen
+
+    def surrounded(self, chosen: Tensor) -> Tensor:
+        """Which patches [K] have most of their neighbours among the patches ``chosen`` [K] bool."""
+        index = knn(self.g.means[self.rows], None, min(8, len(self.rows) - 1), True)[1]
+        beside = self.patch[index] != self.patch[:, None]
+        count = torch.zeros(2, self.count)
+        count[0].index_add_(0, self.patch, beside.sum(1).float())
+        count[1].index_add_(0, self.patch, (beside & chosen[self.patch[index]]).sum(1).float())
+        return count[1] > 0.5 * count[0].clamp_min(1)
 
     def without(self, chosen: Tensor, backdrop: Backdrop) -> tuple[GaussianTensors, Tensor]:
         """The state with the backdrop, at its end, instead of the patches ``chosen`` [K] bool; which of its own it keeps [N] bool."""
