@@ -11,9 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Callable
 
-import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from p2gs.models.canonical import farthest_points, with_static
@@ -21,17 +19,16 @@ from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import render_depths
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.single_state import render_gaussians
+from p2gs.models.walls import DEEPEST, Backdrop, Walls, over_surface
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
-from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
+from p2gs.ops.sh import dc_to_rgb
 from p2gs.types import GaussianTensors
 
 SOLID = 0.3  # opacity from which a Gaussian is surface
 TAU = 0.015  # tolerance along a ray, internal units
 SEEN = 0.05  # share of the other state's views that may see a Gaussian which that state does not confirm
 COVER = 5.0  # pixels, all checked views together, that a patch must cover to be judged
-REACH = 0.3  # how far the colours of a wall are carried to where no ray fell on it, internal units
-DEEPEST = 2.0  # how far behind a surface a wall is looked for, internal units
 CHANNELS = 16
 
 
@@ -40,7 +37,8 @@ class OpeningsConfig:
     """Options of the room behind openings.
 
     may_lose: patches give way where the image error over each of them rises to no more than this times what it was; 0 = off. drawers: the
-    same for patches of sliding parts, which have insides that go with them, as doors hardly do. rest: the same for patches most of whose neighbours gave way.
+    same for patches of sliding parts, which have insides that go with them, as doors hardly do. rest: the same for patches most of whose
+    neighbours gave way.
     patch: Gaussians a patch. looks, checks: views of a state from which rays are cast, and by which patches are judged; size: their
     long edge in pixels. apart: surfaces that the other state shows within this are confirmed by it; cell: grid of the walls; wall: their
     thickness (all internal units).
@@ -58,73 +56,6 @@ class OpeningsConfig:
     wall: float = 0.03
 
 
-class Walls:
-    """Where the base is known to be solid, as a grid, closed by the sides of the box around everything.
-
-    points [N, 3] on known surfaces; lo, hi [3]: the box.  cell: size of a voxel.
-    """
-
-    def __init__(self, points: Tensor, lo: Tensor, hi: Tensor, cell: float):
-        self.lo, self.cell = lo.double() - 2 * cell, cell
-        self.size = ((hi.double() + 2 * cell - self.lo) / cell).ceil().long() + 1
-        grid = torch.zeros(tuple(self.size.tolist()), dtype=torch.bool)
-        at, inside = self._voxels(points)
-        grid[tuple(at[inside].T)] = True
-        # the gaps between the Gaussians of a wall
-        self.grid = torch.from_numpy(ndimage.binary_closing(grid.numpy())) | grid
-        for axis in range(3):
-            for side in (slice(0, 3), slice(-3, None)):
-                self.grid[(slice(None),) * axis + (side,)] = True
-
-    def _voxels(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        at = ((points.double() - self.lo) / self.cell).floor().long()
-        return at, ((at >= 0) & (at < self.size)).all(-1)
-
-    def meet(self, origins: Tensor, ways: Tensor, chunk: int = 4096) -> Tensor:
-        """Distance [R] at which rays from origins [R, 3] along unit ways [R, 3] meet a wall, from two voxels on; inf where they do not."""
-        steps = torch.arange(2 * self.cell, DEEPEST, self.cell / 2, dtype=torch.float64)
-        out = []
-        for o, w in zip(origins.double().split(chunk), ways.double().split(chunk), strict=True):
-            at, inside = self._voxels(o[:, None] + w[:, None] * steps[:, None])
-            hit = inside & self.grid[tuple(torch.where(inside[..., None], at, 0).unbind(-1))]
-            out.append(torch.where(hit.any(1), steps[hit.to(torch.uint8).argmax(1)], torch.inf))
-        return torch.cat(out) if out else torch.zeros(0, dtype=torch.float64)
-
-
-@dataclass
-class Backdrop:
-    """The inner sides of walls that rays through patches meet. points [P, 3]; of each ray its point [R], colour [R, 3] and patch [R]."""
-
-    points: Tensor
-    where: Tensor
-    colours: Tensor
-    patch: Tensor
-    cell: float
-
-    def paint(self, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean colour [P, 3] of the rays through the patches ``chosen`` [K] bool, and which points one fell on [P]."""
-        rays = chosen[self.patch]
-        count = torch.zeros(len(self.points)).index_add_(0, self.where[rays], torch.ones(int(rays.sum())))
-        colour = torch.zeros(len(self.points), 3).index_add_(0, self.where[rays], self.colours[rays])
-        return colour / count.clamp_min(1)[:, None], count > 0
-
-    def gaussians(self, chosen: Tensor, bases: int) -> tuple[GaussianTensors, Tensor]:
-        """The backdrop as rays through the patches ``chosen`` [K] bool paint it, gaps in the colours beside them; ``bases`` of the SH. And
-        which of its Gaussians a ray fell on."""
-        colour, painted = self.paint(chosen)
-        keep, near = painted.clone(), painted.clone()
-        if painted.any() and not painted.all():
-            distance, index = knn(self.points[painted], self.points[~painted], min(4, int(painted.sum())), False)
-            colour[~painted] = colour[painted][index].mean(1)
-            keep[~painted], near[~painted] = distance[:, 0] < REACH, distance[:, 0] < 3 * self.cell
-        n = int(keep.sum())
-        sh = torch.zeros(n, bases, 3)
-        sh[:, 0] = rgb_to_dc(colour[keep])
-        size = torch.full((n, 3), float(np.log(0.8 * self.cell)))
-        quats = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
-        return GaussianTensors(self.points[keep], quats, size, torch.full((n,), 3.0), sh), near[keep]
-
-
 def unconfirmed(g: GaussianTensors, labels: Tensor, transforms: Tensor, other: GaussianTensors, stack: DepthStack, apart: float) -> Tensor:
     """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its views see, and farther
     than ``apart`` from its surfaces.  transforms [K-1, 4, 4] to the other state; stack: its rendered depth."""
@@ -134,13 +65,6 @@ def unconfirmed(g: GaussianTensors, labels: Tensor, transforms: Tensor, other: G
     hidden = (behind > 0) & (free + on <= SEEN * (free + on + behind))
     solid = torch.sigmoid(other.opacity_logits) > SOLID
     return hidden & (knn(other.means[solid], landed, 1, False)[0][:, 0] > apart)
-
-
-def over_surface(g: GaussianTensors, count: int = 24, seed: int = 0) -> Tensor:
-    """``count`` points of each Gaussian's body, within 1.7 standard deviations, [N * count, 3]."""
-    z = torch.randn(len(g), count, 3, generator=torch.Generator().manual_seed(seed)).clamp(-1.7, 1.7) * g.log_scales.exp()[:, None]
-    R = so3.quat_to_matrix(so3.quat_normalize(g.quats))
-    return (g.means[:, None] + (R[:, None] * z[:, :, None]).sum(-1)).reshape(-1, 3)
 
 
 def patches(g: GaussianTensors, size: int, rounds: int = 10) -> Tensor:
@@ -300,15 +224,18 @@ def open_up(
     away = (motions.transforms, se3.inverse(motions.transforms))
     g = [s.gaussians for s in states]
     solid = [torch.sigmoid(x.opacity_logits) > SOLID for x in g]
+    counted = [{"unconfirmed": 0, "patches": 0, "gave_way": 0, "removed": 0, "added": 0} for _ in states]
+    if min(int(k.sum()) for k in solid) < config.patch:  # no object: fusion says so
+        return states, motions, stacks, counted
     lids = [unconfirmed(g[s], motions.labels[s], away[s], g[1 - s], stacks[1 - s], config.apart) for s in (0, 1)]
     base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
     slides = torch.tensor([False] + [kind == "prismatic" for kind in motions.types])
     box = torch.quantile(torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0)
     walls = Walls(torch.cat([over_surface(x[k]) for x, k in zip(g, base, strict=True)]), box[0], box[1], config.cell)
-    out, labels, margin, depth, counted = list(states), list(motions.labels), list(motions.margin), list(stacks), []
+    out, labels, margin, depth = list(states), list(motions.labels), list(motions.margin), list(stacks)
     for s in (0, 1):
-        counted.append({"unconfirmed": int(lids[s].sum()), "patches": 0, "gave_way": 0, "removed": 0, "added": 0})
-        if not (lids[s] & solid[s]).any():
+        counted[s]["unconfirmed"] = int(lids[s].sum())
+        if int((lids[s] & solid[s]).sum()) < config.patch:
             continue
         state = OneState(g[s], lids[s], slides[motions.labels[s]], views[s], config, backend, device)
         backdrop = state.backdrop(walls, stacks)

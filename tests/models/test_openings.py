@@ -10,7 +10,8 @@ from p2gs.data.views import TrainingViews
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.openings import Backdrop, OpeningsConfig, Walls, open_up, over_surface, patches, unconfirmed
+from p2gs.models.openings import OpeningsConfig, open_up, patches, unconfirmed
+from p2gs.models.walls import Backdrop, Walls, over_surface
 from p2gs.ops import se3
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
 from p2gs.render import rasterize_stored
@@ -132,6 +133,14 @@ def test_a_drawers_inside_must_not_be_explained_worse_at_all():
     motions = replace(motions, types=["revolute", "prismatic"], transforms=torch.stack([HINGE, slide]), confidence=torch.ones(2))
     motions.labels[1][-len(lid) :] = 2
     assert open_up(states, motions, views, stacks, none, backend="auto")[3][1]["removed"] > 0
+
+
+def test_states_without_an_object_are_left_to_fusion():
+    lid = panel([-0.37, 0.2, -0.27], [0.74, 0, 0], [0, 0, 0.54], DARK)
+    states, motions, views, stacks = scene(lid, [lid])
+    states[0].gaussians.opacity_logits.fill_(-4.0)
+    out, told, _, counted = open_up(states, motions, views, stacks, OpeningsConfig(), backend="auto")
+    assert out is states and told is motions and all(c["removed"] == 0 for c in counted)
 
 
 def test_unconfirmed_is_what_is_hidden_and_far_from_what_the_other_state_shows():
