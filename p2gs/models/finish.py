@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -229,7 +229,10 @@ def measure(
             photometric_cost(states[s].gaussians, record.labels[s], ways[s], views[1 - s], count=8, **options) for s in (0, 1)
         ]
     both = [record.polish[w] for w in ("forward", "backward")] if "backward" in record.polish else None
-    record.evidence = measure_joints(states, record.labels, record.after, types, views, stacks, both=both, **options)
+    known = [m >= 0 for m in record.margin]
+    shown = [replace(s, gaussians=s.gaussians[k]) for s, k in zip(states, known, strict=True)]
+    labels = [x[k] for x, k in zip(record.labels, known, strict=True)]
+    record.evidence = measure_joints(shown, labels, record.after, types, views, stacks, both=both, **options)
 
 
 def make_joint(kind: str, transform: Tensor, centre: Tensor) -> Joint:

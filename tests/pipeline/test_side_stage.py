@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -59,9 +60,10 @@ def test_both_states_at_once_give_the_bits_of_one_after_the_other(tmp_path):
 
 def test_an_interrupt_stops_both_and_keeps_what_they_have(tmp_path):
     run = tmp_path / "run"
-    process = subprocess.Popen(
-        command(config(tmp_path, 20000), run, 2), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment()
-    )
+    started = command(config(tmp_path, 20000), run, 2)
+    # what a script starts in the background ignores interrupts, and so would what is started here
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(started, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(), preexec_fn=heed)
     saved = [run / "checkpoints" / f"single_state_{s}.ckpt" for s in (0, 1)]
     deadline = time.time() + 100
     while not all(p.exists() for p in saved) and process.poll() is None and time.time() < deadline:
