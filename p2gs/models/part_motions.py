@@ -32,7 +32,8 @@ class PartMotionsConfig:
     candidates: how many complete explanations are compared by re-rendering; of more, those that look best after ``look_steps`` of
     refinement at the smallest size.  contenders: how many of these go on through all that follows, up to ``reconsider``, where they differ
     and their image loss is within the share ``contend`` of the best: a wrong start may lead nowhere, and a worse one to the truth. It
-    must then win by ``contend_win``: by less, junk wins too.
+    must then win by ``contend_win``: by less, junk wins too.  tie: image losses within this share do not tell which comes first; what the
+    search made of the surfaces does (a dark flap is its own mirror image to the photographs).
     coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
     freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: the same for a further part.
@@ -56,6 +57,7 @@ class PartMotionsConfig:
     contenders: int = 2
     contend: float = 0.1
     contend_win: float = 0.05
+    tie: float = 0.02
     look_steps: int = 40
     compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
@@ -127,7 +129,7 @@ def find_part_motions(
         looks = [first_look(e) for e in explanations]
         order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
         explanations = [explanations[i] for i in order]
-    refined, costs, tried, level = [], [], [], config.coarse.levels[-1]
+    refined, values, costs, tried, level = [], [], [], [], config.coarse.levels[-1]
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
@@ -138,9 +140,10 @@ def find_part_motions(
         cost = explanation_cost(states, motions, views, level, backend, device)
         costs.append(cost)
         rank = _rank(cost, motions, config)
-        tried.append({"types": motions.types, "cost": cost, "rank": rank, "reductions": reductions})
+        tried.append({"types": motions.types, "cost": cost, "rank": rank, "value": explanation.value, "reductions": reductions})
         refined.append((rank, number, motions))
-    contenders = _contenders(refined, config)
+        values.append(explanation.value)
+    contenders = _contenders(refined, values, config)
     limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
     ends, contests = [], []
     for _, number, motions in contenders:
@@ -182,10 +185,15 @@ def _rank(cost: float, motions: PartMotions, config: PartMotionsConfig) -> float
     return cost * (1 + config.part_penalty) ** len(motions)
 
 
-def _contenders(refined: list[tuple[float, int, PartMotions]], config: PartMotionsConfig) -> list[tuple[float, int, PartMotions]]:
-    """Of (rank, number, motions), the best first and those that are nearly as good and say something else."""
+def _contenders(
+    refined: list[tuple[float, int, PartMotions]], values: list[float], config: PartMotionsConfig
+) -> list[tuple[float, int, PartMotions]]:
+    """Of (rank, number, motions), the best first and those that are nearly as good and say something else; where the photographs hardly
+    tell which is best, the surfaces do. values: what discovery's search made of each, by number; more is better."""
     ordered, out = sorted(refined, key=lambda t: t[:2]), []
-    for rank, number, motions in ordered:
+    tied = [t for t in ordered if t[0] <= ordered[0][0] * (1 + config.tie)]
+    first = max(tied, key=lambda t: values[t[1]])
+    for rank, number, motions in [first, *(t for t in ordered if t is not first)]:
         close = rank <= ordered[0][0] * (1 + config.contend)
         if not out or (close and not any(_same(motions, other, config.same_motion) for _, _, other in out)):
             out.append((rank, number, motions))

@@ -111,8 +111,8 @@ def test_what_is_nearly_as_good_and_says_something_else_goes_on():
     a, b, same = ("prismatic", slide()), ("revolute", hinge()), ("prismatic", near)
     config = PartMotionsConfig(contenders=2, contend=0.1)
 
-    def numbers(*ranked, config=config):
-        return [n for _, n, _ in _contenders([(rank, n, _explained(*m)) for n, (rank, m) in enumerate(ranked)], config)]
+    def numbers(*ranked, config=config, values=(0.5, 0.5, 0.5)):
+        return [n for _, n, _ in _contenders([(rank, n, _explained(*m)) for n, (rank, m) in enumerate(ranked)], values, config)]
 
     assert numbers((1.05, [a]), (1.0, [b])) == [1, 0]
     assert numbers((1.0, [a]), (1.2, [b])) == [0]  # too much worse
@@ -121,6 +121,9 @@ def test_what_is_nearly_as_good_and_says_something_else_goes_on():
     assert numbers((1.0, [a]), (1.01, [b]), (1.02, [])) == [0, 1]  # two at most
     assert numbers((1.0, [a]), (1.01, [b]), config=PartMotionsConfig(contenders=1)) == [0]
     assert numbers((1.0, [])) == [0]
+    # a tie of the photographs: what the surfaces prefer comes first
+    assert numbers((1.0, [a]), (1.015, [b]), values=(0.6, 0.7)) == [1, 0]
+    assert numbers((1.0, [a]), (1.03, [b]), values=(0.6, 0.7)) == [0, 1]
 
 
 def test_a_contender_must_win_clearly():
