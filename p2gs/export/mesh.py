@@ -19,12 +19,12 @@ from p2gs.export.twin_json import load_twin
 from p2gs.export.unseen import close_unseen_sides
 from p2gs.export.views import NamedCamera, bounds, orbit, read_cameras
 from p2gs.ops.blend import likeliest
+from p2gs.render.base import MAX_FEATURES
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, UserError
 
 STATES = ("start", "end")
 RESOLUTION = 160  # voxels along the longest side of the object's box
 VIEWS = 64  # a state
-FEATURES = 16  # channels a rasterizer takes at once
 FIRM = 0.8  # opacity a ray must meet to count as a sighting of surface
 FOG = 2.5  # times the usual spread of depth along a ray: what is more is fog
 NEAR = 0.02  # of the object's longest side: see look and fog_limit
@@ -56,8 +56,8 @@ def look(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera, nea
     """
     onehot = torch.nn.functional.one_hot(part_index, parts).float()
     reference = float(g.means.mean(0) @ camera.viewmat[2, :3] + camera.viewmat[2, 3])
-    out = draw(g, camera, 0.0, features=onehot[:, :FEATURES], depth_sq=True, depth_ref=reference)
-    more = onehot[:, FEATURES:].split(FEATURES, 1) if parts > FEATURES else ()
+    out = draw(g, camera, 0.0, features=onehot[:, :MAX_FEATURES], depth_sq=True, depth_ref=reference)
+    more = onehot[:, MAX_FEATURES:].split(MAX_FEATURES, 1) if parts > MAX_FEATURES else ()
     shares = [out.features] + [draw(g, camera, 0.0, features=c).features for c in more]
     mean = out.expected_depth
     median = mean if out.median_depth is None else out.median_depth  # gsplat gives none

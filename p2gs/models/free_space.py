@@ -59,6 +59,12 @@ def seen_through(means: Tensor, labels: Tensor, transforms: Tensor, stack: Depth
     return out
 
 
+def landed(means: Tensor, labels: Tensor, transforms: Tensor) -> Tensor:
+    """Where Gaussians come to lie in the other state, [N, 3]. means [N, 3]; labels [N]; transforms [K-1, 4, 4] to it."""
+    T = with_static(transforms).to(means)[labels]
+    return (T[:, :3, :3] * means[:, None]).sum(-1) + T[:, :3, 3]
+
+
 @torch.no_grad()
 def hidden_share(means: Tensor, labels: Tensor, transforms: Tensor, stack: DepthStack, tau: float) -> Tensor:
     """Share of the other state's views in which something is in front of each Gaussian of one state, carried there, [N] float.
@@ -66,6 +72,5 @@ def hidden_share(means: Tensor, labels: Tensor, transforms: Tensor, stack: Depth
     means [N, 3]; labels [N]; transforms [K-1, 4, 4] to the other state; stack: rendered depth of the other state; tau: tolerance along the
     ray (scene units). Views that do not contain a Gaussian say nothing; 0 where none does.
     """
-    T = with_static(transforms).to(means)[labels]
-    free, on, behind = stack.counts((T[:, :3, :3] * means[:, None]).sum(-1) + T[:, :3, 3], tau)
+    free, on, behind = stack.counts(landed(means, labels, transforms), tau)
     return behind / (free + on + behind).clamp_min(1)

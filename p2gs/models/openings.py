@@ -14,22 +14,23 @@ from typing import Callable
 import torch
 from torch import Tensor
 
-from p2gs.models.canonical import farthest_points, with_static
+from p2gs.models.canonical import farthest_points
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import render_depths
+from p2gs.models.free_space import landed
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.single_state import render_gaussians
 from p2gs.models.walls import DEEPEST, Backdrop, Walls, over_surface
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.ops.sh import dc_to_rgb
+from p2gs.render.base import MAX_FEATURES
 from p2gs.types import GaussianTensors
 
 SOLID = 0.3  # opacity from which a Gaussian is surface
 TAU = 0.015  # tolerance along a ray, internal units
 SEEN = 0.05  # share of the other state's views that may see a Gaussian which that state does not confirm
 COVER = 5.0  # pixels, all checked views together, that a patch must cover to be judged
-CHANNELS = 16
 
 
 @dataclass
@@ -59,12 +60,11 @@ class OpeningsConfig:
 def unconfirmed(g: GaussianTensors, labels: Tensor, transforms: Tensor, other: GaussianTensors, stack: DepthStack, apart: float) -> Tensor:
     """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its views see, and farther
     than ``apart`` from its surfaces.  transforms [K-1, 4, 4] to the other state; stack: its rendered depth."""
-    T = with_static(transforms).to(g.means)[labels]
-    landed = (T[:, :3, :3] * g.means[:, None]).sum(-1) + T[:, :3, 3]
-    free, on, behind = stack.counts(landed, TAU)
+    at = landed(g.means, labels, transforms)
+    free, on, behind = stack.counts(at, TAU)
     hidden = (behind > 0) & (free + on <= SEEN * (free + on + behind))
     solid = torch.sigmoid(other.opacity_logits) > SOLID
-    return hidden & (knn(other.means[solid], landed, 1, False)[0][:, 0] > apart)
+    return hidden & (knn(other.means[solid], at, 1, False)[0][:, 0] > apart)
 
 
 def patches(g: GaussianTensors, size: int, rounds: int = 10) -> Tensor:
@@ -149,7 +149,7 @@ class OneState:
         shots = [self.views.get(i, self.level, grey) for i in self.views.spread(self.config.checks)]
         onehot = torch.zeros(len(self.g), self.count)
         onehot[self.rows, self.patch] = 1
-        chunks = onehot.split(CHANNELS, 1)
+        chunks = onehot.split(MAX_FEATURES, 1)
         weight = [torch.cat([self.render(self.g, s.camera, grey, c).features.cpu() for c in chunks], -1) for s in shots]
         pixels = [w.sum(-1) > 0.01 for w in weight]
         weight = torch.cat([w[p] for w, p in zip(weight, pixels, strict=True)]).T.contiguous()  # [K, pixels that any patch covers]
@@ -198,11 +198,13 @@ class OneState:
         count[1].index_add_(0, self.patch, (beside & chosen[self.patch[index]]).sum(1).float())
         return count[1] > 0.5 * count[0].clamp_min(1)
 
-    def without(self, chosen: Tensor, backdrop: Backdrop) -> tuple[GaussianTensors, Tensor]:
-        """The state with the backdrop, at its end, instead of the patches ``chosen`` [K] bool; which of its own it keeps [N] bool."""
+    def without(self, chosen: Tensor, backdrop: Backdrop) -> tuple[GaussianTensors, Tensor, Tensor]:
+        """The state with the backdrop, at its end, instead of the patches ``chosen`` [K] bool; which of its own it keeps [N] bool; which
+        of the backdrop's a ray fell on or beside."""
         keep = torch.ones(len(self.g), dtype=torch.bool)
         keep[self.rows[chosen[self.patch]]] = False
-        return GaussianTensors.cat([self.g[keep], backdrop.gaussians(chosen, self.g.sh.shape[1])[0]]), keep
+        behind, near = backdrop.gaussians(chosen, self.g.sh.shape[1])
+        return GaussianTensors.cat([self.g[keep], behind]), keep, near
 
 
 @torch.no_grad()
@@ -243,12 +245,12 @@ def open_up(
         counted[s] |= {"patches": state.count, "gave_way": int(chosen.sum())}
         if not chosen.any():
             continue
-        new, kept = state.without(chosen, backdrop)
+        new, kept, near = state.without(chosen, backdrop)
         cameras = stacks[s].cameras
         depth[s] = DepthStack(*render_depths(new, cameras, backend, device), cameras)
         seen = torch.ones(len(new), dtype=torch.bool)
         n = int(kept.sum())
-        seen[n:] = backdrop.gaussians(chosen, 1)[1] | (depth[s].counts(new.means[n:], TAU)[1] > 0)
+        seen[n:] = near | (depth[s].counts(new.means[n:], TAU)[1] > 0)
         extra = int(seen.sum() - kept.sum())
         counted[s] |= {"removed": int((~kept).sum()), "added": extra}
         out[s] = replace(states[s], gaussians=new[seen])

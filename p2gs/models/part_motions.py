@@ -129,7 +129,7 @@ def find_part_motions(
         looks = [first_look(e) for e in explanations]
         order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
         explanations = [explanations[i] for i in order]
-    refined, values, costs, tried, level = [], [], [], [], config.coarse.levels[-1]
+    refined, costs, tried, level = [], [], [], config.coarse.levels[-1]
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
@@ -142,8 +142,7 @@ def find_part_motions(
         rank = _rank(cost, motions, config)
         tried.append({"types": motions.types, "cost": cost, "rank": rank, "value": explanation.value, "reductions": reductions})
         refined.append((rank, number, motions))
-        values.append(explanation.value)
-    contenders = _contenders(refined, values, config)
+    contenders = _contenders(refined, [t["value"] for t in tried], config)
     limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
     ends, contests = [], []
     for _, number, motions in contenders:

@@ -77,7 +77,7 @@ class Backdrop:
 
     def gaussians(self, chosen: Tensor, bases: int) -> tuple[GaussianTensors, Tensor]:
         """The backdrop as rays through the patches ``chosen`` [K] bool paint it, gaps in the colours beside them; ``bases`` of the SH. And
-        which of its Gaussians a ray fell on."""
+        which of its Gaussians a ray fell on or beside."""
         colour, painted = self.paint(chosen)
         keep, near = painted.clone(), painted.clone()
         if painted.any() and not painted.all():
