@@ -29,13 +29,14 @@ from p2gs.models.finish import finish
 from p2gs.models.openings import open_up
 from p2gs.models.part_motions import find_part_motions
 from p2gs.models.phase import Phase
+from p2gs.models.sharpen import SharpenPhase
 from p2gs.models.single_state import SingleStatePhase
 from p2gs.native import keep_memory
 from p2gs.side_stage import SideStage, can_run_beside
 from p2gs.stage_times import note_stage
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError
 
-STAGES = ("single_state", "discovery", "canonical_fusion", "articulation", "finish")
+STAGES = ("single_state", "discovery", "sharpen", "canonical_fusion", "articulation", "finish")
 
 
 def run(cfg: RunConfig, only: Optional[str] = None) -> Path:
@@ -126,6 +127,10 @@ class Pipeline:
         motions = self.stage("discovery", only, lambda: self.discover(states)) if self.init == "discovery" else None
         if only == "discovery":
             return self.run_dir
+        found_in = states
+        states = [self.stage(name := f"sharpen_{s.state}", only, partial(self.train, name, partial(self.sharpen, s))) for s in states]
+        if only == "sharpen":
+            return self.run_dir
         canonical = self.stage("canonical_fusion", only, partial(self.train, "canonical_fusion", partial(self.fusion, states, motions)))
         if only == "canonical_fusion":
             return self.run_dir
@@ -134,7 +139,7 @@ class Pipeline:
         )
         if only == "articulation":
             return self.run_dir
-        self.stage("finish", only, lambda: self.write(learned, states, canonical, motions))
+        self.stage("finish", only, lambda: self.write(learned, found_in, states, canonical, motions))
         return self.run_dir
 
     def stage(self, name: str, only: Optional[str], make: Callable[[], Any]) -> Any:
@@ -165,8 +170,13 @@ class Pipeline:
         print(f"{name}: {seconds:.1f} s, peak memory {peak} MiB", flush=True)
 
     # -- stages ---------------------------------------------------------------------------------------------------------------
+    @property
+    def backend(self) -> str:
+        """What draws from sharpening to the last polish."""
+        return self.cfg.phases["sharpen"].config.backend(self.cfg.rasterizer)
+
     def common(self) -> dict:
-        return {"seed": self.cfg.seed, "rasterizer": self.cfg.rasterizer}
+        return {"seed": self.cfg.seed, "rasterizer": self.backend}
 
     def single_states(self, only: Optional[str]) -> list[handover.StateGaussians]:
         """Both states, at once where there are threads for it. Each has half of the threads then, also when it is the only one left to
@@ -196,7 +206,8 @@ class Pipeline:
         self.keep(name, self.train_state(name))
 
     def single_state(self, state: int, section) -> Phase:
-        return SingleStatePhase(section.config, section.losses, self.scene, state, self.views_of(state), **self.common())
+        options = {"seed": self.cfg.seed, "rasterizer": self.cfg.rasterizer}
+        return SingleStatePhase(section.config, section.losses, self.scene, state, self.views_of(state), **options)
 
     def discover(self, states) -> handover.PartMotions:
         return find_part_motions(
@@ -211,10 +222,13 @@ class Pipeline:
             report=lambda *text: print("discovery:", *text, flush=True),
         )
 
+    def sharpen(self, state, section) -> Phase:
+        return SharpenPhase(section.config, section.losses, state, self.views_of(state.state), **self.common())
+
     def fusion(self, states, motions, section) -> Phase:
         stacks = counted = None
         if motions is not None and len(motions) and section.config.canonical.free_space > 0:
-            found, backend = self.cfg.phases["discovery"].config, {"backend": self.cfg.rasterizer, "device": self.device}
+            found, backend = self.cfg.phases["discovery"].config, {"backend": self.backend, "device": self.device}
             size = (found.evidence_size, found.min_opacity)
             train = [self.scene.select(state=s.state, split="train") for s in states]
             seen = [gather_evidence(s.gaussians, v, *size, **backend) for s, v in zip(states, train, strict=True)]
@@ -282,8 +296,8 @@ class Pipeline:
         print(f"{stage}: going on from {path}", flush=True)
         return str(path)
 
-    def write(self, learned: handover.Articulation, states, canonical, motions) -> dict:
-        """The twin and the result folder; returns what a later run needs to know of it."""
+    def write(self, learned: handover.Articulation, found_in, states, canonical, motions) -> dict:
+        """The twin and the result folder; returns what a later run needs to know of it. found_in: the states before they were sharpened."""
         from p2gs.export.diagnostics_page import write_diagnosis
         from p2gs.export.run_folder import complete_run, write_twin
 
@@ -296,13 +310,14 @@ class Pipeline:
             self.scene.similarity,
             self.cfg.phases["articulation"].losses,
             seed=self.cfg.seed,
-            backend=self.cfg.rasterizer,
+            backend=self.backend,
+            twin_backend=self.cfg.rasterizer,
             device=device,
         )
         for note in notes:
             print(note, flush=True)
-        stages = StageResults(states, motions, canonical, learned, record, notes)
-        options = {"min_margin": config.unclear, "backend": self.cfg.rasterizer, "device": device}
+        stages = StageResults(found_in, motions, states, canonical, learned, record, notes)
+        options = {"min_margin": config.unclear, "backend": self.backend, "twin_backend": self.cfg.rasterizer, "device": device}
         write_diagnosis(self.run_dir, stages, obj, self.views, **options)
         write_twin(obj, self.run_dir, self.scene)
         if config.exports:

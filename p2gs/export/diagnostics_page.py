@@ -28,12 +28,21 @@ TITLES = {
 
 
 def write_diagnosis(
-    run_dir: Path | str, stages: StageResults, twin: ArticulatedObject, views, *, min_margin: float, backend: str = "auto", device="cpu"
+    run_dir: Path | str,
+    stages: StageResults,
+    twin: ArticulatedObject,
+    views,
+    *,
+    min_margin: float,
+    backend: str = "auto",
+    twin_backend: str | None = None,
+    device="cpu",
 ) -> dict:
     """Measure, judge, draw and write: what the end of every fit does. Parameters as of ``models.diagnosis.diagnose``, twin in internal
     units. Returns what the JSON holds."""
-    d = diagnose(stages, twin, views, min_margin=min_margin, backend=backend, device=device)
-    return write_diagnostics(run_dir, d, diagnostic_strips(stages, twin, views, min_margin), INTERNAL_DIAGONAL / twin.similarity.scale)
+    d = diagnose(stages, twin, views, min_margin=min_margin, backend=backend, twin_backend=twin_backend, device=device)
+    strips = diagnostic_strips(stages, twin, views, min_margin, backend)
+    return write_diagnostics(run_dir, d, strips, INTERNAL_DIAGONAL / twin.similarity.scale)
 
 
 def write_diagnostics(run_dir: Path | str, diagnosis: dict, strips: Sequence[tuple[str, str, np.ndarray]], diagonal: float) -> dict:
@@ -108,9 +117,10 @@ def _verdict(d: dict) -> str:
 
 def _single(d: dict) -> list[str]:
     rows = [
-        [k, f"{s['psnr']:.1f}", f"{s['alpha_iou']:.3f}", f"{s['gaussians']:,}", f"{s['fog']:.0%}"] for k, s in d["single_state"].items()
+        [k, f"{s['psnr']:.1f}", f"{s['psnr_sharpened']:.1f}", f"{s['alpha_iou']:.3f}", f"{s['gaussians']:,}", f"{s['fog']:.0%}"]
+        for k, s in d["single_state"].items()
     ]
-    return [table(["state", "PSNR, training views [dB]", "silhouette IoU", "Gaussians", "half-transparent"], rows)]
+    return [table(["state", "PSNR, training views [dB]", "sharpened", "silhouette IoU", "Gaussians", "half-transparent"], rows)]
 
 
 def _discovery(d: dict) -> list[str]:

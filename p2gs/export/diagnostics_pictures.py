@@ -25,10 +25,10 @@ UNCLEAR = (0.85, 0.10, 0.75)
 
 @torch.no_grad()
 def diagnostic_strips(
-    stages: StageResults, twin: ArticulatedObject, views: dict[int, TrainingViews], min_margin: float
+    stages: StageResults, twin: ArticulatedObject, views: dict[int, TrainingViews], min_margin: float, backend: str = "auto"
 ) -> list[tuple[str, str, np.ndarray]]:
-    """(stage, what the strip shows, uint8 picture [H, W, 3]), the start state above the end state."""
-    states, motions, record = stages.states, stages.motions, stages.record
+    """(stage, what the strip shows, uint8 picture [H, W, 3]), the start state above the end state. backend: draws the sharpened states."""
+    states, motions, record = stages.found_in, stages.motions, stages.record
     shots = [chosen_shot(states, record, views, s) for s in (0, 1)]
     photos = [to_image(shot.image) for shot in shots]
     rows: dict[str, list] = {"state": [], "evidence": [], "moved": [], "twin": []}
@@ -43,7 +43,7 @@ def diagnostic_strips(
             if seen is not None:
                 cells.insert(0, ("moved / static / unknown", marked(photo, g[solid], shot.camera, seen, EVIDENCE)))
         rows["evidence"].append(cells)
-        arrived = moved_here(states[1 - s], record, 1 - s, shot)
+        arrived = moved_here(stages.states[1 - s], record, 1 - s, shot, backend)
         whence = f"{STATES[1 - s]} state moved here"
         rows["moved"].append([(f"photograph ({name})", photo), (whence, to_image(arrived)), ("difference", heat(arrived, shot))])
         posed = pose(twin, float(s))
@@ -82,11 +82,11 @@ def chosen_shot(states, record: FinishRecord, views: dict[int, TrainingViews], s
     return mine.get(index, fine, torch.ones(3))
 
 
-def moved_here(state: StateGaussians, record: FinishRecord, s: int, shot: TargetImage) -> Tensor:
+def moved_here(state: StateGaussians, record: FinishRecord, s: int, shot: TargetImage, backend: str) -> Tensor:
     """Colour [H, W, 3] of a state's Gaussians carried to the other state, over white."""
     body = MovedGaussians(state.gaussians, record.labels[s])
     means, quats, sh = body.moved(record.after if s == 0 else se3.inverse(record.after))
-    return draw(GaussianTensors(means, quats, body.g.log_scales, body.g.opacity_logits, sh), shot.camera).colour
+    return draw(GaussianTensors(means, quats, body.g.log_scales, body.g.opacity_logits, sh), shot.camera, backend=backend).colour
 
 
 def heat(colour: Tensor, shot: TargetImage) -> np.ndarray:

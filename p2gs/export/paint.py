@@ -17,6 +17,7 @@ from p2gs.export.pose import part_transform
 from p2gs.ops.palette import part_colour, part_colours
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
 from p2gs.render import rasterize
+from p2gs.render.base import split_backend
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, RenderOutput, UserError
 
 RASTERIZER: ContextVar[str] = ContextVar("rasterizer", default="auto")
@@ -47,13 +48,15 @@ def run_rasterizer(run_dir: Path | str) -> str:
     return str((config or {}).get("rasterizer", "auto")) if isinstance(config, dict) else "auto"
 
 
-def draw(g: GaussianTensors, camera: Camera, background: float | Sequence[float] = 1.0, **options) -> RenderOutput:
+def draw(
+    g: GaussianTensors, camera: Camera, background: float | Sequence[float] = 1.0, *, backend: str | None = None, **options
+) -> RenderOutput:
     """One view of Gaussians that are in the camera's coordinates; background a grey value or RGB. No gradients; results on the CPU.
 
-    The rasterizer is that of ``rasterizer_of``, if inside one; gsplat gets the tensors on the GPU.
+    The rasterizer, where none is named, is that of ``rasterizer_of``, if inside one; gsplat gets the tensors on the GPU.
     """
-    backend = RASTERIZER.get()
-    device = torch.device("cuda") if backend == "gsplat" and torch.cuda.is_available() else g.means.device
+    backend = backend or RASTERIZER.get()
+    device = torch.device("cuda") if split_backend(backend)[0] == "gsplat" and torch.cuda.is_available() else g.means.device
     colour = torch.as_tensor(background, dtype=torch.float32, device=device).expand(3).contiguous()
     if device != g.means.device:
         g = g.to(device)

@@ -29,10 +29,12 @@ FOG = (0.1, 0.9)  # opacities that are neither air nor surface
 
 @dataclass
 class StageResults:
-    """What the stages handed over. motions: None where the run started without discovery.  notes: lines about vanished slots."""
+    """What the stages handed over. found_in: the states as discovery had them.  motions: None where the run started without discovery.
+    states: as the stages after it had them (the same Gaussians, sharpened).  notes: lines about vanished slots."""
 
-    states: list[StateGaussians]
+    found_in: list[StateGaussians]
     motions: Optional[PartMotions]
+    states: list[StateGaussians]
     canonical: CanonicalGaussians
     learned: Articulation
     record: FinishRecord
@@ -47,22 +49,28 @@ def diagnose(
     *,
     min_margin: float,
     backend: str = "auto",
+    twin_backend: str | None = None,
     device="cpu",
 ) -> dict:
     """What RUN/diagnostics.json holds, without verdicts and losses.
 
-    views: photographs by state.  min_margin: labels less clear than this count as ambiguous.
+    views: photographs by state.  min_margin: labels less clear than this count as ambiguous.  backend, twin_backend: as of ``finish``; the
+    latter drew the states before they were sharpened, too.
     """
     states, motions, canonical, learned, record = stages.states, stages.motions, stages.canonical, stages.learned, stages.record
+    first = {"backend": twin_backend or backend, "device": device}
     unit = 1.0 / twin.similarity.scale
     render = {"backend": backend, "device": device}
     level = max(n for s in (0, 1) for n in views[s].levels)
     coarse = common_level(views)
     stacks = [state_depth(state, views[s], coarse, count=16, **render) for s, state in enumerate(states)]
+    single = {STATES[s.state]: reconstruction(s.gaussians, views[s.state], level, **first) for s in stages.found_in}
+    for s in states:
+        single[STATES[s.state]]["psnr_sharpened"] = reconstruction(s.gaussians, views[s.state], level, **render)["psnr"]
     d = {
         "format": FORMAT,
-        "single_state": {STATES[s.state]: reconstruction(s.gaussians, views[s.state], level, **render) for s in states},
-        "motion_evidence": None if motions is None else motion_evidence(motions, states),
+        "single_state": single,
+        "motion_evidence": None if motions is None else motion_evidence(motions, stages.found_in),
         "discovery": None if motions is None else discovery(motions, unit),
         "labels": {STATES[s]: labelling(states[s], record, s, min_margin, stacks[1 - s]) for s in (0, 1)},
         "fusion": fusion(canonical, learned.canonical_time),

@@ -154,12 +154,13 @@ def finish(
     *,
     seed: int,
     backend: str,
+    twin_backend: str | None = None,
     device="cpu",
 ) -> tuple[ArticulatedObject, list[str], FinishRecord]:
     """The twin, one line for each slot that vanished, and what was measured on the way.
 
-    views: photographs by state.  losses: those of the last training phase, for ``tune`` (None: it is left out).  A part's confidence is
-    ``JointEvidence.confidence`` of its joint.
+    views: photographs by state.  losses: those of the last training phase, for ``tune`` (None: it is left out).  backend: draws the states,
+    twin_backend: the twin in ``tune`` (None: the same).  A part's confidence is ``JointEvidence.confidence`` of its joint.
     """
     labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
     alive = surviving_slots(learned, labels, config)
@@ -198,6 +199,7 @@ def finish(
         record.after = transforms
         record.polish = single_ways(states, refined, views, config.polish, stacks, **options)
         measure(record, states, types, views, stacks, level, backend, device)
+    options["backend"] = twin_backend or backend
     gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
     parts = [Part(0, None, int((labels == 0).sum()))]
     for k, kind in enumerate(types):

@@ -17,6 +17,7 @@ from p2gs.models.adam import NamedAdam
 from p2gs.models.splats import Splats
 from p2gs.native import serial_torch
 from p2gs.registry import Registry
+from p2gs.render import draws_natively
 from p2gs.types import UserError
 
 PHASES: Registry[type["Phase"]] = Registry("phase")
@@ -147,8 +148,7 @@ class Phase(LightningModule):
         return total
 
     def training_step(self, batch, batch_idx):
-        native_step = self.splats.means.device.type == "cpu" and self.rasterizer in ("auto", "cpu")
-        with serial_torch(native_step):
+        with serial_torch(draws_natively(self.splats.means, self.rasterizer)):
             self.one_step()
 
     def one_step(self) -> None:

@@ -19,6 +19,7 @@ from p2gs.models.single_state import SplatRates, render_gaussians
 from p2gs.models.splats import Splats
 from p2gs.native import serial_torch
 from p2gs.ops import se3
+from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
 
 PICTURE_LOSSES = ("render", "alpha", "depth")  # priors on surfaces have had their say, and cost more PSNR here than they gain in shape
@@ -29,9 +30,9 @@ class TuneConfig:
     """Options of the last fit of the Gaussians. steps: over both states, in turn (0 = off).  levels: image sizes (long edge, pixels), of
     which the last is used."""
 
-    steps: int = 600
+    steps: int = 900
     levels: list[int] = field(default_factory=lambda: [400])
-    rates: SplatRates = field(default_factory=lambda: SplatRates(1e-4, 4e-6, 1.5e-3, 2e-2, 6e-4, 2e-3, 2e-4))
+    rates: SplatRates = field(default_factory=lambda: SplatRates(3e-4, 4e-6, 2e-2, 1.2e-1, 3e-3, 1e-2, 2e-3))
 
 
 def tune(
@@ -80,7 +81,7 @@ def tune(
         sum(values).backward()
         optimizer.step()
 
-    with serial_torch(splats.means.device.type == "cpu" and backend in ("auto", "cpu")):
+    with serial_torch(draws_natively(splats.means, backend)):
         for step in range(config.steps):
             one_step(step)
     return splats.tensors().detach().to("cpu").clone()

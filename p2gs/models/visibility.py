@@ -13,14 +13,14 @@ from torch import Tensor
 
 from p2gs.ops import so3
 from p2gs.render import rasterize
-from p2gs.render.base import ANTIALIAS, EPS2D
+from p2gs.render.base import PIXELS, Pixels, split_backend
 from p2gs.types import Camera, GaussianTensors
 
 
-def footprint(g: GaussianTensors, camera: Camera, eps2d: float = EPS2D, antialias: bool = ANTIALIAS) -> Tensor:
+def footprint(g: GaussianTensors, camera: Camera, pixels: Pixels = PIXELS["classic"]) -> Tensor:
     """What each Gaussian alone would add to the image's alpha, summed over pixels: opacity * 2 pi sqrt(det of its 2D covariance), [N].
 
-    0 for what lies behind the camera. The covariance is the rasterizer's: EWA, ``eps2d`` pixels^2 added unless opacities fall by as much.
+    0 for what lies behind the camera. The covariance is the rasterizer's: EWA, ``pixels.eps2d`` added unless opacities fall by as much.
     """
     W, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     p = g.means @ W.T + t
@@ -30,7 +30,7 @@ def footprint(g: GaussianTensors, camera: Camera, eps2d: float = EPS2D, antialia
     J = torch.stack([fx / z, zero, -fx * p[:, 0] / z**2, zero, fy / z, -fy * p[:, 1] / z**2], -1).reshape(-1, 2, 3)
     P = J @ W @ so3.quat_to_matrix(so3.quat_normalize(g.quats)) * g.log_scales.exp()[:, None, :]
     cov = P @ P.transpose(1, 2)
-    added = 0.0 if antialias else eps2d
+    added = 0.0 if pixels.antialias else pixels.eps2d
     det = (cov[:, 0, 0] + added) * (cov[:, 1, 1] + added) - cov[:, 0, 1] ** 2
     area = 2 * math.pi * det.clamp_min(0).sqrt() * torch.sigmoid(g.opacity_logits)
     return torch.where(p[:, 2] > 0.01, area, torch.zeros_like(area))
@@ -44,6 +44,7 @@ def visible_share(g: GaussianTensors, cameras: list[Camera], backend: str = "aut
     g = g.detach().to(device)
     best = torch.zeros(len(g), device=device)
     features = torch.zeros(len(g), 1, device=device, requires_grad=True)
+    _, pixels = split_backend(backend)
     options = {"sh_degree": 0, "features": features, "backend": backend}
     for camera in cameras:
         camera = camera.to(device)
@@ -52,5 +53,5 @@ def visible_share(g: GaussianTensors, cameras: list[Camera], backend: str = "aut
             camera.viewmat, camera.K, camera.width, camera.height, **options,
         )  # fmt: skip
         (seen,) = torch.autograd.grad(out.features.sum(), features)
-        best = torch.maximum(best, seen[:, 0] / footprint(g, camera).clamp_min(1e-6))
+        best = torch.maximum(best, seen[:, 0] / footprint(g, camera, pixels).clamp_min(1e-6))
     return best.clamp(0, 1).cpu()

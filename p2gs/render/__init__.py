@@ -16,10 +16,10 @@ from torch import Tensor
 
 from p2gs.native import native, warn_missing_once
 from p2gs.registry import suggest
-from p2gs.render.base import ANTIALIAS, EPS2D, RASTERIZERS, Rasterizer, RenderInputs, check
+from p2gs.render.base import RASTERIZERS, Rasterizer, RenderInputs, check, split_backend, with_pixels
 from p2gs.types import RenderOutput, UserError
 
-__all__ = ["RASTERIZERS", "RenderInputs", "find_rasterizer", "rasterize", "rasterize_stored"]
+__all__ = ["RASTERIZERS", "RenderInputs", "draws_natively", "find_rasterizer", "rasterize", "rasterize_stored", "with_pixels"]
 
 _BUILT_IN = ("cpu", "gsplat", "torch_ref")
 _warned: set[str] = set()
@@ -32,6 +32,11 @@ def find_rasterizer(name: str) -> Rasterizer:
             raise UserError(f"unknown rasterizer '{name}'{suggest(name, {*RASTERIZERS, *_BUILT_IN})}")
         importlib.import_module(f"p2gs.render.{name}")
     return RASTERIZERS[name]
+
+
+def draws_natively(means: Tensor, backend: str) -> bool:
+    """Whether the native kernels draw these: torch is better left with one thread beside them."""
+    return means.device.type == "cpu" and split_backend(backend)[0] in ("auto", "cpu")
 
 
 def _auto(means: Tensor) -> str:
@@ -71,8 +76,8 @@ def rasterize(
     depth_sq: bool = False,
     depth_ref: float = 0.0,
     near: float = 0.01,
-    eps2d: float = EPS2D,
-    antialias: bool = ANTIALIAS,
+    eps2d: Optional[float] = None,
+    antialias: Optional[bool] = None,
     absgrad: bool = False,
     median_depth: Optional[bool] = None,
     backend: str = "auto",
@@ -85,10 +90,11 @@ def rasterize(
     background [3] or [H, W, 3] (default black).  depth_sq: also accumulate (z - depth_ref)^2.
     near: Gaussians nearer than this (scene units) are culled.  eps2d: variance in pixels^2 added to every projected
     Gaussian, the pixel's own extent.  antialias: its opacity falls by as much as its area grows by that (Yu et al. 2024, Mip-Splatting,
-    arXiv:2311.16493), so that a surface seen edge-on is as thin as it is.
+    arXiv:2311.16493), so that a surface seen edge-on is as thin as it is. Both None: as ``backend`` has it.
     absgrad: the backward pass fills ``means2d_abs_grad`` [N] = length of (sum |dL/dx|, sum |dL/dy|) over pixels, pixel units
     (Ye et al. 2024, arXiv:2404.10484).  median_depth: also give the depth where transmittance passes one half; by default only
-    when no gradient is recorded.  backend: a name in ``RASTERIZERS`` or "auto" (cpu or gsplat by device, else torch_ref).
+    when no gradient is recorded.  backend: a name in ``RASTERIZERS`` or "auto" (cpu or gsplat by device, else torch_ref), and its pixels:
+    "NAME" or "NAME:classic" is 3DGS (eps2d 0.3), "NAME:sharp" eps2d 0.1 and antialias.
 
     A Gaussian contributes alpha = min(0.99, opacity exp(-d^T C^-1 d / 2)) where that is at least 1/255; a pixel is finished
     before its transmittance would fall to 1e-4; colour is max(0, 0.5 + SH(view direction)). A Gaussian with a NaN or infinity in
@@ -96,12 +102,14 @@ def rasterize(
 
     Raises ValueError for shapes that do not fit, UserError for a backend that is unknown or cannot run here.
     """
+    name, pixels = split_backend(backend)
+    eps2d, antialias = pixels.eps2d if eps2d is None else eps2d, pixels.antialias if antialias is None else antialias
     inputs = RenderInputs(
         means, quats, scales, opacities, sh, viewmat, K, int(width), int(height), -1, features, background,
         bool(depth_sq), float(depth_ref), float(near), float(eps2d), bool(antialias), bool(absgrad), False,
     )  # fmt: skip
     check(inputs, sh_degree, median_depth)
-    return find_rasterizer(_auto(means) if backend == "auto" else backend)(inputs)
+    return find_rasterizer(_auto(means) if name == "auto" else name)(inputs)
 
 
 def rasterize_stored(
@@ -129,9 +137,10 @@ def rasterize_stored(
     """
     if sh_rest is not None and sh_rest.shape[1] == 0:
         sh_rest = None
-    name = _auto(means) if backend == "auto" else backend
+    name, pixels = split_backend(backend)
+    name = _auto(means) if name == "auto" else name
     options = {
-        "depth_sq": False, "depth_ref": 0.0, "near": 0.01, "eps2d": EPS2D, "antialias": ANTIALIAS, "absgrad": False,
+        "depth_sq": False, "depth_ref": 0.0, "near": 0.01, "eps2d": pixels.eps2d, "antialias": pixels.antialias, "absgrad": False,
         "median_depth": None, **options,
     }  # fmt: skip
     if name != "cpu":

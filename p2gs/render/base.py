@@ -9,15 +9,39 @@ import torch
 from torch import Tensor
 
 from p2gs.ops.sh import degree_of
-from p2gs.registry import Registry
-from p2gs.types import RenderOutput
+from p2gs.registry import Registry, suggest
+from p2gs.types import RenderOutput, UserError
 
 ALPHA_MIN = 1 / 255  # a Gaussian fainter than this at a pixel is skipped there
 ALPHA_MAX = 0.99  # and none is more opaque
 T_STOP = 1e-4  # a pixel is finished before its transmittance would fall to this
 FAR = 1e10
-EPS2D, ANTIALIAS = 0.3, False  # what 3DGS has; 0.1 and True draw edges better (docs/measured.md), but part discovery is not up to it yet
 MAX_FEATURES = 16
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """What a pixel makes of a Gaussian (see ``p2gs.render.rasterize``)."""
+
+    eps2d: float
+    antialias: bool
+
+
+# "classic": every 3DGS viewer's. "sharp": a surface seen edge-on is as thin as it is. Gaussians are for the pixels they were fitted with.
+PIXELS = {"classic": Pixels(0.3, False), "sharp": Pixels(0.1, True)}
+
+
+def split_backend(backend: str) -> tuple[str, Pixels]:
+    """A backend's name and its pixels: "cpu:sharp" -> ("cpu", PIXELS["sharp"]), "cpu" -> ("cpu", PIXELS["classic"]). Raises UserError."""
+    name, _, pixels = backend.partition(":")
+    if pixels and pixels not in PIXELS:
+        raise UserError(f"rasterizer '{backend}': unknown pixels '{pixels}'{suggest(pixels, PIXELS)}")
+    return name, PIXELS[pixels or "classic"]
+
+
+def with_pixels(backend: str, pixels: str) -> str:
+    """The same backend with the pixels named."""
+    return f"{backend.partition(':')[0]}:{pixels}"
 
 
 @dataclass

@@ -42,7 +42,7 @@ def small_run(found=None, polish_steps=0):
     learned = Articulation(g, torch.nn.functional.one_hot(labels, 2).float(), ["revolute"], T, torch.ones(1), 0.0)
     config = FinishConfig(polish=PolishConfig(steps=polish_steps, levels=[64], level_starts=[0.0], min_margin=0.1), clean_neighbours=0)
     twin, notes, record = finish(learned, states, views, config, Similarity(scale=2.0), seed=0, backend="auto")
-    return StageResults(states, motions, canonical, learned, record, notes), twin, views
+    return StageResults(states, motions, states, canonical, learned, record, notes), twin, views
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.free_space import seen_through
 from p2gs.models.visibility import footprint, visible_share
 from p2gs.render import rasterize
+from p2gs.render.base import PIXELS
 from p2gs.types import GaussianTensors
 
 
@@ -24,13 +25,13 @@ def ring(size=64, count=6):
     return [look_at(torch.stack([3 * a.cos(), 3 * a.sin(), torch.tensor(1.0)]), size) for a in angle]
 
 
-@pytest.mark.parametrize("pixel", [{"eps2d": 0.3, "antialias": False}, {"eps2d": 0.1, "antialias": True}])
-def test_footprint_is_what_one_gaussian_adds_to_alpha(pixel):
+@pytest.mark.parametrize("pixels", PIXELS)
+def test_footprint_is_what_one_gaussian_adds_to_alpha(pixels):
     g = gaussians(torch.tensor([[0.1, -0.2, 0.1]]), torch.tensor([0.08]), 0.7)
     for camera in ring():
         activated = (g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh)
-        out = rasterize(*activated, camera.viewmat, camera.K, 64, 64, **pixel)
-        assert float(footprint(g, camera, **pixel)[0]) == pytest.approx(float(out.alpha.sum()), rel=0.03)
+        out = rasterize(*activated, camera.viewmat, camera.K, 64, 64, backend=f"auto:{pixels}")
+        assert float(footprint(g, camera, PIXELS[pixels])[0]) == pytest.approx(float(out.alpha.sum()), rel=0.03)
 
 
 def test_what_a_shell_encloses_is_hidden_and_the_shell_is_not():

@@ -10,6 +10,7 @@ from worlds import INPUTS, backward, world
 
 from p2gs.native import native
 from p2gs.render import rasterize
+from p2gs.render.base import PIXELS
 from p2gs.types import UserError
 
 BACKENDS = ["torch_ref"] + (["cpu"] if native is not None else [])
@@ -27,6 +28,21 @@ def test_no_and_one_gaussian(backend, n):
     if n == 0:
         assert torch.equal(out.alpha, torch.zeros(5, 9))
         assert torch.allclose(out.colour, leaves["background"].expand(5, 9, 3))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_pixels_by_name_are_the_options_they_stand_for(backend):
+    w = world(50, 20, 16, seed=3)
+    colour = {p: w.render(f"{backend}:{p}", torch.float32)[0].colour for p in PIXELS}
+    for name, pixels in PIXELS.items():
+        assert torch.equal(colour[name], w.render(backend, torch.float32, eps2d=pixels.eps2d, antialias=pixels.antialias)[0].colour)
+    assert torch.equal(colour["classic"], w.render(backend, torch.float32)[0].colour)
+    assert not torch.equal(colour["classic"], colour["sharp"])
+
+
+def test_unknown_pixels_are_told_in_one_sentence():
+    with pytest.raises(UserError, match="rasterizer 'auto:sharpe': unknown pixels 'sharpe'.*sharp"):
+        world(1, 4, 4).render("auto:sharpe", torch.float32)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
