@@ -131,7 +131,8 @@ class Pipeline:
         states = [self.stage(name := f"sharpen_{s.state}", only, partial(self.train, name, partial(self.sharpen, s))) for s in states]
         if only == "sharpen":
             return self.run_dir
-        canonical = self.stage("canonical_fusion", only, partial(self.train, "canonical_fusion", partial(self.fusion, states, motions)))
+        fuse = partial(self.fusion, found_in, states, motions)
+        canonical = self.stage("canonical_fusion", only, partial(self.train, "canonical_fusion", fuse))
         if only == "canonical_fusion":
             return self.run_dir
         learned = self.stage(
@@ -225,17 +226,19 @@ class Pipeline:
     def sharpen(self, state, section) -> Phase:
         return SharpenPhase(section.config, section.losses, state, self.views_of(state.state), **self.common())
 
-    def fusion(self, states, motions, section) -> Phase:
+    def fusion(self, found_in, states, motions, section) -> Phase:
+        """found_in: the states before they were sharpened: an overfitted lid explains noise that no wall behind it does."""
         stacks = counted = None
         if motions is not None and len(motions) and section.config.canonical.free_space > 0:
-            found, backend = self.cfg.phases["discovery"].config, {"backend": self.backend, "device": self.device}
+            found, backend = self.cfg.phases["discovery"].config, {"backend": self.cfg.rasterizer, "device": self.device}
             size = (found.evidence_size, found.min_opacity)
             train = [self.scene.select(state=s.state, split="train") for s in states]
-            seen = [gather_evidence(s.gaussians, v, *size, **backend) for s, v in zip(states, train, strict=True)]
+            seen = [gather_evidence(s.gaussians, v, *size, **backend) for s, v in zip(found_in, train, strict=True)]
             stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in seen]
             told = any(v.depth is not None for views in train for v in views)  # where depth is given nothing is open
             if section.config.openings.may_lose > 0 and not told:
-                states, motions, stacks, counted = open_up(states, motions, self.views, stacks, section.config.openings, **backend)
+                openings, motions, stacks, counted = open_up(found_in, motions, self.views, stacks, section.config.openings, **backend)
+                states = [opening.of(s) for opening, s in zip(openings, states, strict=True)]
                 gone, come = (sum(c[k] for c in counted) for k in ("removed", "added"))
                 print(f"canonical_fusion: {gone} Gaussians before openings gave way to {come} on the walls behind them", flush=True)
         options = {"stacks": stacks, "openings": counted, **self.common()}

@@ -57,6 +57,18 @@ class OpeningsConfig:
     wall: float = 0.03
 
 
+@dataclass
+class Opening:
+    """What becomes of a state: ``kept`` [N] of its Gaussians stay, and the walls' inner sides come after them."""
+
+    kept: Tensor
+    behind: GaussianTensors
+
+    def of(self, state: StateGaussians) -> StateGaussians:
+        """The state opened up, or the same Gaussians further trained."""
+        return replace(state, gaussians=GaussianTensors.cat([state.gaussians[self.kept], self.behind]))
+
+
 def unconfirmed(g: GaussianTensors, labels: Tensor, transforms: Tensor, other: GaussianTensors, stack: DepthStack, apart: float) -> Tensor:
     """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its views see, and farther
     than ``apart`` from its surfaces.  transforms [K-1, 4, 4] to the other state; stack: its rendered depth."""
@@ -217,9 +229,9 @@ def open_up(
     *,
     backend: str,
     device="cpu",
-) -> tuple[list[StateGaussians], PartMotions, list[DepthStack], list[dict]]:
-    """Both states with lids replaced by the inner sides of the walls behind them; the motions with labels of these (the base's), the
-    states' depth, and what was counted, by state.
+) -> tuple[list[Opening], PartMotions, list[DepthStack], list[dict]]:
+    """By state, which lids give way to the inner sides of the walls behind them; the motions with labels of these (the base's), the depth
+    of both states so opened, and what was counted, by state.
 
     views: ``TrainingViews`` by state; stacks: rendered depth of both states.
     """
@@ -227,14 +239,15 @@ def open_up(
     g = [s.gaussians for s in states]
     solid = [torch.sigmoid(x.opacity_logits) > SOLID for x in g]
     counted = [{"unconfirmed": 0, "patches": 0, "gave_way": 0, "removed": 0, "added": 0} for _ in states]
+    out = [Opening(torch.ones(len(x), dtype=torch.bool), x[:0]) for x in g]
     if min(int(k.sum()) for k in solid) < config.patch:  # no object: fusion says so
-        return states, motions, stacks, counted
+        return out, motions, stacks, counted
     lids = [unconfirmed(g[s], motions.labels[s], away[s], g[1 - s], stacks[1 - s], config.apart) for s in (0, 1)]
     base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
     slides = torch.tensor([False] + [kind == "prismatic" for kind in motions.types])
     box = torch.quantile(torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0)
     walls = Walls(torch.cat([over_surface(x[k]) for x, k in zip(g, base, strict=True)]), box[0], box[1], config.cell)
-    out, labels, margin, depth = list(states), list(motions.labels), list(motions.margin), list(stacks)
+    labels, margin, depth = list(motions.labels), list(motions.margin), list(stacks)
     for s in (0, 1):
         counted[s]["unconfirmed"] = int(lids[s].sum())
         if int((lids[s] & solid[s]).sum()) < config.patch:
@@ -253,7 +266,7 @@ def open_up(
         seen[n:] = near | (depth[s].counts(new.means[n:], TAU)[1] > 0)
         extra = int(seen.sum() - kept.sum())
         counted[s] |= {"removed": int((~kept).sum()), "added": extra}
-        out[s] = replace(states[s], gaussians=new[seen])
+        out[s] = Opening(kept, new[n:][seen[n:]])
         labels[s] = torch.cat([labels[s][kept], torch.zeros(extra, dtype=torch.int64)])
         margin[s] = torch.cat([margin[s][kept], torch.ones(extra)])
     return out, replace(motions, labels=labels, margin=margin), depth, counted
