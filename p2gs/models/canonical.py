@@ -96,7 +96,7 @@ def carry(g: GaussianTensors, labels: Tensor, transforms: Tensor) -> GaussianTen
     R = T[:, :3, :3]
     means = (R[labels] * g.means[:, None, :]).sum(-1) + T[labels, :3, 3]
     quats = so3.quat_multiply(so3.matrix_to_quat(R)[labels], so3.quat_normalize(g.quats))
-    return GaussianTensors(means, quats, g.log_scales, g.opacity_logits, g.sh)
+    return g.placed(means, quats)
 
 
 def with_static(transforms: Tensor) -> Tensor:

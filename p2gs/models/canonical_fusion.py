@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs
-from p2gs.models.canonical import CanonicalConfig, carry, fuse, keep_rows, with_static
+from p2gs.models.canonical import CanonicalConfig, fuse, keep_rows, with_static
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.free_space import explain_by_free_space, hidden_share
 from p2gs.models.handover import CanonicalGaussians, PartMotions, StateGaussians
@@ -16,7 +16,8 @@ from p2gs.models.openings import OpeningsConfig
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
 from p2gs.models.splats import Splats
-from p2gs.ops import se3
+from p2gs.ops import se3, so3
+from p2gs.ops.carry import RigidMoves
 from p2gs.types import GaussianTensors
 
 SURFACE = 0.015  # tolerance of rendered depth (internal units): nearer than this to a surface is on it
@@ -71,6 +72,7 @@ class CanonicalFusionPhase(ImagePhase):
             carried["offsets"] = fused.offsets
         self.splats = Splats(fused.gaussians, carried=carried)
         self.counted = fused.diagnostics if openings is None else {**fused.diagnostics, "openings": openings}
+        self.moves: list[RigidMoves] | None = None  # made when labels are where they stay
         self.register_buffer("betas", fused.betas)
         self.register_buffer("transforms", transforms)
 
@@ -86,8 +88,9 @@ class CanonicalFusionPhase(ImagePhase):
         g = self.splats.tensors()
         if hasattr(self.splats, "offsets"):
             return g.placed(g.means + self.splats.offsets[:, state], g.quats)
-        T = se3.screw_at(with_static(self.transforms), state - (1 - self.betas))
-        return carry(g, self.splats.labels, T)
+        if self.moves is None:
+            self.moves = [RigidMoves(self.splats.labels, se3.screw_at(self.transforms, s - (1 - self.betas[1:]))) for s in (0, 1)]
+        return g.placed(*self.moves[state](g.means, so3.quat_normalize(g.quats)))
 
     def inputs(self, step: int) -> LossInputs:
         state = step % 2

@@ -14,11 +14,11 @@ from torch import Tensor
 from p2gs.data.views import TrainingViews, view_index
 from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.adam import NamedAdam
-from p2gs.models.canonical import carry, with_static
 from p2gs.models.single_state import SplatRates, render_gaussians
 from p2gs.models.splats import Splats
 from p2gs.native import serial_torch
-from p2gs.ops import se3
+from p2gs.ops import se3, so3
+from p2gs.ops.carry import RigidMoves
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
 
@@ -57,7 +57,7 @@ def tune(
     if config.steps <= 0 or "render" not in losses or len(gaussians) == 0:
         return gaussians
     splats, labels = Splats(gaussians).to(device), labels.to(device)
-    motions = [se3.screw_at(with_static(transforms), state - time).to(device) for state in (0, 1)]
+    moves = [RigidMoves(labels, se3.screw_at(transforms, state - time).to(device)) for state in (0, 1)]
     rates = config.rates.at(0.0)
     optimizer = NamedAdam([{"params": [getattr(splats, name)], "lr": rate, "name": name} for name, rate in rates.items()], eps=1e-15)
     cache: dict = {}
@@ -74,7 +74,8 @@ def tune(
         camera, background = shot.camera.to(device), background.to(device)
         target = Target(shot.image.to(device), shot.alpha.to(device), background, depth)
         g = splats.tensors()
-        render = render_gaussians(carry(g, labels, motions[state]), camera, background, backend=backend)
+        posed = g.placed(*moves[state](g.means, so3.quat_normalize(g.quats)))
+        render = render_gaussians(posed, camera, background, backend=backend)
         inputs = LossInputs(step, config.steps, g, render, target, camera, cache=cache)
         values = [value for value in (loss(inputs) for loss in losses.values()) if value is not None]
         optimizer.zero_grad(set_to_none=True)

@@ -73,6 +73,41 @@ def carry_reference(means: Tensor, quats: Tensor, sh: Tensor, parts: Parts, tran
     return means, quats, rotate_sh(sh, transforms[:, :3, :3], parts.labels) if sh.shape[1] > 1 else sh
 
 
+class RigidMoves:
+    """Motions that stay, for Gaussians that learn: like ``carry`` without harmonics, with gradients by means and quats.
+
+    labels [N] int64; transforms [K-1, 4, 4], part k moves by transforms[k-1].
+    """
+
+    def __init__(self, labels: Tensor, transforms: Tensor):
+        self.parts, self.transforms = Parts(labels), transforms
+        self.back = torch.eye(4, dtype=transforms.dtype, device=transforms.device).expand_as(transforms).clone()
+        self.back[:, :3, :3] = transforms[:, :3, :3].transpose(1, 2)
+        # q and -q turn alike, but a gradient by q knows which it was: of a half turn the inverse may come out as the other one
+        still = torch.zeros(len(labels), 4).to(labels.device)
+        still[:, 0] = 1
+        there = carry(still[:, 1:], still, still[:, None, 1:], self.parts, transforms)[1]
+        again = carry(still[:, 1:], there, still[:, None, 1:], self.parts, self.back)[1]
+        self.sign = torch.where(again[:, :1] < 0, -1.0, 1.0)
+
+    def __call__(self, means: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
+        """Means [N, 3] and quats [N, 4] after the motions."""
+        return _Moved.apply(means, quats, self)
+
+
+class _Moved(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, quats, moves):
+        ctx.moves = moves
+        return carry(means, quats, means[:, None], moves.parts, moves.transforms)[:2]
+
+    @staticmethod
+    def backward(ctx, grad_means, grad_quats):
+        m = ctx.moves
+        grad_means, grad_quats, _ = carry(grad_means, grad_quats, grad_means[:, None], m.parts, m.back)
+        return grad_means, grad_quats * m.sign, None
+
+
 @lru_cache(maxsize=None)
 def _tables(degree: int) -> Tensor:
     """What ``rotation_matrices`` knows of the bands, one behind the other, float64."""

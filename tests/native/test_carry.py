@@ -3,9 +3,12 @@
 import pytest
 import torch
 
+from p2gs.models.canonical import carry as carry_in_torch
+from p2gs.models.canonical import with_static
 from p2gs.ops import se3
-from p2gs.ops.carry import Parts, carry, carry_reference
+from p2gs.ops.carry import Parts, RigidMoves, carry, carry_reference
 from p2gs.ops.sh import evaluate
+from p2gs.types import GaussianTensors
 
 
 def setting(n=777, parts=3, degree=3):
@@ -84,3 +87,32 @@ def test_what_does_not_fit():
         carry(means, quats, sh, Parts(labels), transforms[:2])
     with pytest.raises(ValueError, match="carry wants"):
         carry(means[:-1], quats, sh, Parts(labels), transforms)
+
+
+@pytest.mark.parametrize("half_turns", [False, True])
+def test_moves_with_gradients(isa, half_turns):
+    means, quats, sh, labels, transforms = setting(500, 3)
+    if half_turns:
+        for k in range(3):
+            transforms[k, :3, :3] = torch.diag(torch.tensor([1.0 if i == k else -1.0 for i in range(3)]))
+    weights = torch.randn(500, 3), torch.randn(500, 4)
+
+    def run(move, dtype):
+        leaves = [t.detach().to(dtype).requires_grad_(True) for t in (means, quats)]
+        moved = move(*leaves)
+        # of q and -q, which turn alike, take the one on the side of a fixed direction
+        side = torch.where((moved[1].detach() * weights[1].to(dtype)).sum(1, keepdim=True) < 0, -1.0, 1.0)
+        ((moved[0] * weights[0]).sum() + (moved[1] * side * weights[1]).sum()).backward()
+        return [moved[0].detach(), moved[1].detach() * side, *(t.grad for t in leaves)]
+
+    def slow(m, q):
+        g = carry_in_torch(GaussianTensors(m, q, m, m[:, 0], m[:, None]), labels, with_static(transforms))
+        return g.means, g.quats * q.detach().norm(dim=1, keepdim=True)
+
+    ours, exact = run(RigidMoves(labels, transforms), torch.float32), run(slow, torch.float64)
+    for a, b in list(zip(ours, exact, strict=True))[:3]:
+        assert torch.allclose(a.double(), b, atol=1e-5)
+    # the slow way also normalises: compare what is left of the gradient across q
+    across = exact[3] - quats * (exact[3] * quats).sum(1, keepdim=True)
+    mine = ours[3] - quats * (ours[3] * quats).sum(1, keepdim=True)
+    assert torch.allclose(mine.double(), across, atol=1e-5)
