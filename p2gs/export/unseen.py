@@ -1,8 +1,8 @@
 """Sides of a mesh that no camera saw: what stands on the floor has an underside, though no photograph shows it.
 
-A mesh from photographs is open where nobody looked. A side of its bounding box is closed by a plane where space just inside was never seen
-to be empty, no surface was seen near, and what was seen of the object reaches down to that plane around it. The plane's rim is drawn to the
-mesh's open edges.
+A mesh from photographs is open where nobody looked. A side of its bounding box which no camera faced is closed by a plane where space
+just inside was never seen to be empty, no surface was seen near, and what was seen of the object reaches down to that plane around it. The
+plane's rim is drawn to the mesh's open edges.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from torch import Tensor
 from p2gs.export.depth_view import DepthView, pixel_matrix, pixels, seen_points
 from p2gs.export.tsdf import Mesh
 from p2gs.export.unique_rows import unique_rows
+from p2gs.ops import se3
 
 NEAR = 4.0  # voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges
 LEAST = 0.2  # share of a side of the box that must be unseen for it to be closed
+FACED = 0.05  # share of the views that may face a side of which it is still said that nobody looked at it
 RIM = 0.5  # share of the unseen area's rim that must touch seen surface
 
 
@@ -31,6 +33,14 @@ def seen_empty(points: Tensor, views: Sequence[DepthView], poses: Sequence[Tenso
         depth = torch.where(view.labels < 0, torch.full_like(view.depth, torch.inf), view.depth).reshape(-1)
         empty |= torch.cat([depth, depth.new_tensor([-torch.inf])])[pixel] - z > clearance
     return empty
+
+
+def facing(points: Tensor, outward: Tensor, views: Sequence[DepthView], poses: Sequence[Tensor], least: float = 0.2) -> float:
+    """Share of the views that see points [n, 3] of a plane, from their middle, under a cosine with its normal ``outward`` [3] of at least
+    ``least``."""
+    eyes = torch.cat([se3.apply(se3.inverse(T.double()), v.camera.position.double()[None]) for v, T in zip(views, poses, strict=True)])
+    way = torch.nn.functional.normalize(eyes - points.mean(0), dim=1)
+    return float((way @ outward.double() >= least).double().mean())
 
 
 def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, clearance: float) -> Mesh:
@@ -53,6 +63,8 @@ def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[T
         for at, outward in ((lo[axis], -1.0), (hi[axis], 1.0)):
             points = np.full((grid[0].size, 3), at)
             points[:, across] = np.stack([g.ravel() for g in grid], 1)
+            if facing(torch.as_tensor(points), outward * torch.eye(3)[axis], views, poses) > FACED:
+                continue
             within = points.copy()
             within[:, axis] -= outward * voxel
             solid = ~seen_empty(torch.as_tensor(within), views, poses, clearance).numpy()

@@ -13,7 +13,7 @@ from p2gs.data.raytrace import trace
 from p2gs.data.textures import Texture
 from p2gs.export.depth_view import DepthView, add_normals
 from p2gs.export.tsdf import Mesh, fuse
-from p2gs.export.unseen import close_unseen_sides, seen_empty
+from p2gs.export.unseen import close_unseen_sides, facing, seen_empty
 
 EYE = torch.eye(4, dtype=torch.float64)
 VOXEL = 0.03
@@ -40,20 +40,22 @@ TABLE = boards(
 )
 
 
-def look(primitives, cameras):
+def look(primitives, cameras, lids=0):
+    """Views of boards, the last ``lids`` of which are another part's."""
     views = []
     for c in cameras:
         K, axis = c.K.double().numpy(), (np.arange(c.width) + 0.5 - c.width / 2) / float(c.K[0, 0])
-        z, _ = trace(primitives, c.viewmat.double().numpy(), K, axis, axis)
+        z, which = trace(primitives, c.viewmat.double().numpy(), K, axis, axis)
         hit = torch.from_numpy(np.isfinite(z))
+        labels = torch.from_numpy(which >= len(primitives) - lids).long()
         depth = torch.where(hit, torch.from_numpy(z), torch.zeros(z.shape))
-        views.append(add_normals(DepthView(c, depth, torch.where(hit, 0, -1), torch.full((*z.shape, 3), 0.5)), 2 * VOXEL))
+        views.append(add_normals(DepthView(c, depth, torch.where(hit, labels, -1), torch.full((*z.shape, 3), 0.5)), 2 * VOXEL))
     return views
 
 
-def closed(primitives, elevations=(15.0, 40.0)):
+def closed(primitives, elevations=(15.0, 40.0), lids=0):
     """A mesh as it was seen, and with its unseen sides closed."""
-    views = look(primitives, ring(12, 160, elevations=elevations))
+    views = look(primitives, ring(12, 160, elevations=elevations), lids)
     poses = [EYE] * len(views)
     mesh = fuse(views, poses, 0, VOXEL, 4 * VOXEL, 2 * VOXEL)
     return mesh, close_unseen_sides(mesh, views, poses, 0, VOXEL, 4 * VOXEL)
@@ -76,6 +78,25 @@ def test_what_is_seen_is_left_alone():
         mesh, same = closed(primitives, elevations)
         assert len(mesh.faces) and same is mesh
     assert len(close_unseen_sides(Mesh.empty(), [], [], 0, VOXEL, 4 * VOXEL).faces) == 0
+
+
+def test_a_mouth_that_a_door_covers_is_not_closed():
+    """Cameras faced it: it is a door that they saw there, though nothing tells that the space behind is empty."""
+    door = boards(((0.5, -0.4, -0.3), (0.54, 0.4, 0.3)))
+    mesh, whole = closed(CRATE + door, lids=1)
+    assert len(mesh.faces) < len(whole.faces)  # its underside
+    front = [t.triangles_center[:, 0] > 0.4 for t in (trimesh.Trimesh(m.vertices, m.faces, process=False) for m in (mesh, whole))]
+    assert front[1].sum() < 1.5 * front[0].sum()
+
+
+def test_share_of_views_that_face_a_side():
+    views = look(BLOCK, ring(12, 160, elevations=(15.0, 40.0)))
+    side = torch.tensor([[0.5, -0.4, -0.3], [0.5, 0.4, 0.3]]).double()
+    T = EYE.clone()
+    T[0, 3] = 5.0  # the block is far to the right of where the cameras look
+    share = [facing(side, torch.tensor([1.0, 0.0, 0.0]), views, [pose] * len(views)) for pose in (EYE, T)]
+    below = facing(side, torch.tensor([0.0, 0.0, -1.0]), views, [EYE] * len(views))
+    assert 0.2 < share[0] < 0.5 and share[1] == 0.0 and below == 0.0
 
 
 def test_seen_empty_tells_what_is_before_and_behind():
