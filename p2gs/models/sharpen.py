@@ -2,8 +2,9 @@
 
 With 3DGS's pixels (0.3 pixels^2 added to every Gaussian) and thick Gaussians a surface seen edge-on is a stack of faint rims. So that
 outlines come out right, training draws surfaces 0.4 to 0.8 pixels inward, more where a state shows them as outlines: a door's free edge
-when open, not when shut. Joints measured between the two are off by that. Parts are found before, in Gaussians as 3DGS leaves them:
-how well both states' static surfaces agree sets the scale of that search, and moving ones gain less from sharp pixels.
+when open, not when shut. Joints measured between the two are off by that. The loss ``depth_variance`` does its share (it would have rims
+thin, too), so it is not for this phase, which is too short for fog to come back. Parts are found before, in Gaussians as 3DGS leaves
+them: how well both states' static surfaces agree sets the scale of that search, and moving ones gain less from sharp pixels.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ class SharpenConfig(ImageConfig):
     fitted in the end with those of ``rasterizer``, so that any 3DGS viewer shows it as it is.
     """
 
-    steps: int = 300
+    steps: int = 600
     pixels: Literal["sharp", "classic"] = "sharp"
     levels: list[int] = field(default_factory=lambda: [400])
     level_starts: list[float] = field(default_factory=lambda: [0.0])
-    rates: SplatRates = field(default_factory=lambda: SplatRates(5e-5, 4e-6, 1.5e-3, 2e-2, 1e-3, 2e-3, 2e-4))
+    rates: SplatRates = field(default_factory=lambda: SplatRates(5e-5, 4e-6, 5e-3, 2e-2, 1e-3, 2e-3, 2e-4))
 
     def backend(self, rasterizer: str) -> str:
         """``rasterizer`` with the pixels of the stages from here to the polish."""
