@@ -12,14 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import torch
-from torch import Tensor
-
 from p2gs.data.views import TrainingViews
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.handover import StateGaussians
 from p2gs.models.phase import register_phase
-from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
+from p2gs.models.single_state import ImageConfig, SplatRates, StatePhase
 from p2gs.models.splats import Splats
 from p2gs.render import with_pixels
 
@@ -43,23 +40,15 @@ class SharpenConfig(ImageConfig):
 
 
 @register_phase("sharpen")
-class SharpenPhase(ImagePhase):
-    """One state's Gaussians, all of them and in their order (labels of discovery stay theirs). Runs once for each state."""
+class SharpenPhase(StatePhase):
+    """One state's Gaussians, all of them and in their order: labels of discovery stay theirs."""
 
     Config = SharpenConfig
+    picture_name = "sharpen"
 
     def __init__(self, config: SharpenConfig, losses: dict[str, Loss], state: StateGaussians, views: TrainingViews, **common):
-        super().__init__(config, losses, {state.state: views}, **common)
-        self.state = state.state
-        self.seed = self.seed * 2 + state.state
+        super().__init__(config, losses, state.state, views, **common)
         self.splats = Splats(state.gaussians)
-
-    def parameter_groups(self):
-        rates = self.config.rates.at(0.0)
-        return {name: ([getattr(self.splats, name)], rates[name]) for name in rates}
-
-    def learning_rates(self, step: int) -> dict[str, float]:
-        return self.config.rates.at(step / max(self.total_steps, 1))
 
     def inputs(self, step: int) -> LossInputs:
         camera, target = self.target(step, self.state)
@@ -69,11 +58,3 @@ class SharpenPhase(ImagePhase):
 
     def hand_over(self) -> StateGaussians:
         return StateGaussians(self.state, self.splats.tensors().clone())
-
-    @torch.no_grad()
-    def preview(self, times: list[float]) -> dict[str, Tensor]:
-        shot = self.picture(self.state)
-        white = torch.ones(3, device=shot.image.device)
-        out = render_gaussians(self.splats.tensors(), shot.camera, white, backend=self.rasterizer)
-        both = torch.cat([shot.image, out.colour], dim=1)
-        return {f"sharpen_{self.state}": (both.clamp(0, 1) * 255).to(torch.uint8)}

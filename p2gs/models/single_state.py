@@ -149,20 +149,15 @@ def render_gaussians(g: GaussianTensors, camera: Camera, background: Tensor | No
     )
 
 
-@register_phase("single_state")
-class SingleStatePhase(ImagePhase):
-    """3DGS of one state: L_render (paper Eq. 4) plus the losses the config names. Runs once for each state."""
+class StatePhase(ImagePhase):
+    """A phase of one state's Gaussians and photographs, with the config's ``rates``. Runs once for each state."""
 
-    Config = SingleStateConfig
+    picture_name = "state"
 
-    def __init__(
-        self, config: SingleStateConfig, losses: dict[str, Loss], scene: TwoStateScene, state: int, views: TrainingViews, **common
-    ):
+    def __init__(self, config: ImageConfig, losses: dict[str, Loss], state: int, views: TrainingViews, **common):
         super().__init__(config, losses, {state: views}, **common)
         self.state = state
         self.seed = self.seed * 2 + state
-        points, colours = initial_points(scene, state, config.initial_gaussians, config.init, self.generator(0, 2))
-        self.splats = Splats(isotropic_gaussians(points, colours, config.initial_opacity, config.sh_degree))
 
     def parameter_groups(self):
         rates = self.config.rates.at(0.0)
@@ -170,6 +165,28 @@ class SingleStatePhase(ImagePhase):
 
     def learning_rates(self, step: int) -> dict[str, float]:
         return self.config.rates.at(step / max(self.total_steps, 1))
+
+    @torch.no_grad()
+    def preview(self, times: list[float]) -> dict[str, Tensor]:
+        shot = self.picture(self.state)
+        white = torch.ones(3, device=shot.image.device)
+        out = render_gaussians(self.splats.tensors(), shot.camera, white, backend=self.rasterizer)
+        both = torch.cat([shot.image, out.colour], dim=1)
+        return {f"{self.picture_name}_{self.state}": (both.clamp(0, 1) * 255).to(torch.uint8)}
+
+
+@register_phase("single_state")
+class SingleStatePhase(StatePhase):
+    """3DGS of one state: L_render (paper Eq. 4) plus the losses the config names."""
+
+    Config = SingleStateConfig
+
+    def __init__(
+        self, config: SingleStateConfig, losses: dict[str, Loss], scene: TwoStateScene, state: int, views: TrainingViews, **common
+    ):
+        super().__init__(config, losses, state, views, **common)
+        points, colours = initial_points(scene, state, config.initial_gaussians, config.init, self.generator(0, 2))
+        self.splats = Splats(isotropic_gaussians(points, colours, config.initial_opacity, config.sh_degree))
 
     def inputs(self, step: int) -> LossInputs:
         camera, target = self.target(step, self.state)
@@ -184,11 +201,3 @@ class SingleStatePhase(ImagePhase):
             cameras = [views.camera(i, views.levels.index(self.config.levels[-1])) for i in range(len(views))]
             g = g[visible_share(g, cameras, self.rasterizer, g.means.device) >= self.config.min_visible]
         return StateGaussians(self.state, g)
-
-    @torch.no_grad()
-    def preview(self, times: list[float]) -> dict[str, Tensor]:
-        shot = self.picture(self.state)
-        white = torch.ones(3, device=shot.image.device)
-        out = render_gaussians(self.splats.tensors(), shot.camera, white, backend=self.rasterizer)
-        both = torch.cat([shot.image, out.colour], dim=1)
-        return {f"state_{self.state}": (both.clamp(0, 1) * 255).to(torch.uint8)}
