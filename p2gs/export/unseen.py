@@ -35,10 +35,14 @@ def seen_empty(points: Tensor, views: Sequence[DepthView], poses: Sequence[Tenso
     return empty
 
 
-def facing(points: Tensor, outward: Tensor, views: Sequence[DepthView], poses: Sequence[Tensor], least: float = 0.2) -> float:
-    """Share of the views that see points [n, 3] of a plane, from their middle, under a cosine with its normal ``outward`` [3] of at least
-    ``least``."""
-    eyes = torch.cat([se3.apply(se3.inverse(T.double()), v.camera.position.double()[None]) for v, T in zip(views, poses, strict=True)])
+def eyes_of(views: Sequence[DepthView], poses: Sequence[Tensor]) -> Tensor:
+    """Where the views' cameras stand in the part's coordinates, [V, 3] float64."""
+    return torch.cat([se3.apply(se3.inverse(T.double()), v.camera.position.double()[None]) for v, T in zip(views, poses, strict=True)])
+
+
+def facing(points: Tensor, outward: Tensor, eyes: Tensor, least: float = 0.2) -> float:
+    """Share of the cameras at ``eyes`` [V, 3] that see points [n, 3] of a plane, from their middle, under a cosine with its normal
+    ``outward`` [3] of at least ``least``."""
     way = torch.nn.functional.normalize(eyes - points.mean(0), dim=1)
     return float((way @ outward.double() >= least).double().mean())
 
@@ -55,7 +59,7 @@ def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[T
     # the mesh goes on for a voxel or two beyond the edges of what was seen
     seen = torch.cat([seen_points(v, part, T, stride=2) for v, T in zip(views, poses, strict=True)]).numpy()
     lo, hi = np.quantile(seen, 0.002, axis=0), np.quantile(seen, 0.998, axis=0)
-    tree, planes = cKDTree(mesh.vertices), []
+    tree, planes, eyes = cKDTree(mesh.vertices), [], eyes_of(views, poses)
     for axis in range(3):
         across = [i for i in range(3) if i != axis]
         shape = [max(2, round((hi[i] - lo[i]) / voxel) + 1) for i in across]
@@ -63,7 +67,7 @@ def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[T
         for at, outward in ((lo[axis], -1.0), (hi[axis], 1.0)):
             points = np.full((grid[0].size, 3), at)
             points[:, across] = np.stack([g.ravel() for g in grid], 1)
-            if facing(torch.as_tensor(points), outward * torch.eye(3)[axis], views, poses) > FACED:
+            if facing(torch.as_tensor(points), outward * torch.eye(3)[axis], eyes) > FACED:
                 continue
             within = points.copy()
             within[:, axis] -= outward * voxel

@@ -16,7 +16,7 @@ from p2gs.models.openings import OpeningsConfig
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
 from p2gs.models.splats import Splats
-from p2gs.ops import se3, so3
+from p2gs.ops import se3
 from p2gs.ops.carry import RigidMoves
 from p2gs.types import GaussianTensors
 
@@ -90,7 +90,7 @@ class CanonicalFusionPhase(ImagePhase):
             return g.placed(g.means + self.splats.offsets[:, state], g.quats)
         if self.moves is None:
             self.moves = [RigidMoves(self.splats.labels, se3.screw_at(self.transforms, s - (1 - self.betas[1:]))) for s in (0, 1)]
-        return g.placed(*self.moves[state](g.means, so3.quat_normalize(g.quats)))
+        return g.placed(*self.moves[state](g.means, g.quats))
 
     def inputs(self, step: int) -> LossInputs:
         state = step % 2

@@ -17,7 +17,7 @@ from p2gs.models.adam import NamedAdam
 from p2gs.models.single_state import SplatRates, render_gaussians
 from p2gs.models.splats import Splats
 from p2gs.native import serial_torch
-from p2gs.ops import se3, so3
+from p2gs.ops import se3
 from p2gs.ops.carry import RigidMoves
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
@@ -74,7 +74,7 @@ def tune(
         camera, background = shot.camera.to(device), background.to(device)
         target = Target(shot.image.to(device), shot.alpha.to(device), background, depth)
         g = splats.tensors()
-        posed = g.placed(*moves[state](g.means, so3.quat_normalize(g.quats)))
+        posed = g.placed(*moves[state](g.means, g.quats))
         render = render_gaussians(posed, camera, background, backend=backend)
         inputs = LossInputs(step, config.steps, g, render, target, camera, cache=cache)
         values = [value for value in (loss(inputs) for loss in losses.values()) if value is not None]

@@ -91,8 +91,8 @@ class RigidMoves:
         self.sign = torch.where(again[:, :1] < 0, -1.0, 1.0)
 
     def __call__(self, means: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
-        """Means [N, 3] and quats [N, 4] after the motions."""
-        return _Moved.apply(means, quats, self)
+        """Means [N, 3] and quats [N, 4], of any length, after the motions; the latter come back normalised."""
+        return _Moved.apply(means, so3.quat_normalize(quats), self)
 
 
 class _Moved(torch.autograd.Function):

@@ -13,7 +13,7 @@ from p2gs.data.raytrace import trace
 from p2gs.data.textures import Texture
 from p2gs.export.depth_view import DepthView, add_normals
 from p2gs.export.tsdf import Mesh, fuse
-from p2gs.export.unseen import close_unseen_sides, facing, seen_empty
+from p2gs.export.unseen import close_unseen_sides, eyes_of, facing, seen_empty
 
 EYE = torch.eye(4, dtype=torch.float64)
 VOXEL = 0.03
@@ -94,8 +94,8 @@ def test_share_of_views_that_face_a_side():
     side = torch.tensor([[0.5, -0.4, -0.3], [0.5, 0.4, 0.3]]).double()
     T = EYE.clone()
     T[0, 3] = 5.0  # the block is far to the right of where the cameras look
-    share = [facing(side, torch.tensor([1.0, 0.0, 0.0]), views, [pose] * len(views)) for pose in (EYE, T)]
-    below = facing(side, torch.tensor([0.0, 0.0, -1.0]), views, [EYE] * len(views))
+    share = [facing(side, torch.tensor([1.0, 0.0, 0.0]), eyes_of(views, [pose] * len(views))) for pose in (EYE, T)]
+    below = facing(side, torch.tensor([0.0, 0.0, -1.0]), eyes_of(views, [EYE] * len(views)))
     assert 0.2 < share[0] < 0.5 and share[1] == 0.0 and below == 0.0
 
 
