@@ -14,6 +14,8 @@ from torch import Tensor
 from p2gs.export.depth_view import DepthView, add_normals
 from p2gs.export.paint import draw, rasterizer_of
 from p2gs.export.pose import part_transform, pose
+from p2gs.export.surface_depth import surface_depth
+from p2gs.export.trays import complete_tray
 from p2gs.export.tsdf import Mesh, fuse, largest_components
 from p2gs.export.twin_json import load_twin
 from p2gs.export.unseen import close_unseen_sides
@@ -39,7 +41,7 @@ def start_motion(obj: ArticulatedObject, part: int, t: float) -> Tensor:
 @dataclass
 class PartView:
     """What a camera sees of a twin. depth [H, W] along z, 0 where little is hit.  label [H, W] int64: the part that covers most of a
-    pixel, -1 where little is hit.  colour [H, W, 3] in 0..1.  alpha [H, W].  spread [H, W]: standard deviation of depth along the ray."""
+    pixel, -1 where little is hit.  colour [H, W, 3] in 0..1.  alpha [H, W].  spread [H, W]: see ``surface_depth``."""
 
     depth: Tensor
     label: Tensor
@@ -51,24 +53,23 @@ class PartView:
 def look(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera, near: float) -> PartView:
     """Draw the parts. part_index [N] in 0..parts-1.
 
-    near: where the mean depth of a ray lies within this of its median (where transmittance passes one half), the mean is taken: the
-    median jumps from Gaussian to Gaussian. Further apart, the ray meets two surfaces and the mean lies on neither.
+    near: where what a ray meets lies within this, as a standard deviation, it is one surface (``surface_depth``). Where it is not, the ray
+    meets two, the mean of which lies on neither: the depth is then that at which transmittance passes one half.
     """
     onehot = torch.nn.functional.one_hot(part_index, parts).float()
-    reference = float(g.means.mean(0) @ camera.viewmat[2, :3] + camera.viewmat[2, 3])
-    out = draw(g, camera, 0.0, features=onehot[:, :MAX_FEATURES], depth_sq=True, depth_ref=reference)
+    out = draw(g, camera, 0.0, features=onehot[:, :MAX_FEATURES])
     more = onehot[:, MAX_FEATURES:].split(MAX_FEATURES, 1) if parts > MAX_FEATURES else ()
     shares = [out.features] + [draw(g, camera, 0.0, features=c).features for c in more]
-    mean = out.expected_depth
-    median = mean if out.median_depth is None else out.median_depth  # gsplat gives none
+    median = out.expected_depth if out.median_depth is None else out.median_depth  # gsplat gives none
+    depth, spread = surface_depth(g, camera)
     solid = (out.alpha > 0.5) & (median > 0)
     alpha = out.alpha.clamp_min(1e-3)
     return PartView(
-        depth=torch.where(solid, torch.where((mean - median).abs() < near, mean, median), torch.zeros_like(mean)),
+        depth=torch.where(solid, torch.where((depth > 0) & (spread < near), depth, median), torch.zeros_like(depth)),
         label=torch.where(solid, likeliest(torch.cat(shares, -1).flatten(0, 1)).reshape(solid.shape), -1),
         colour=(out.colour / alpha[..., None]).clamp(0, 1),
         alpha=out.alpha,
-        spread=out.depth_variance.clamp_min(0).sqrt() / alpha,
+        spread=spread,
     )
 
 
@@ -103,7 +104,7 @@ def mesh_cameras(obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: 
 
 def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> list[Mesh]:
     """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.  The base's
-    underside and other sides that no camera saw are closed (``close_unseen_sides``).
+    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``).
 
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
     """
@@ -129,6 +130,12 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
         if part.joint is None:
             mesh = close_unseen_sides(mesh, views, poses, k, voxel, TRUNCATION * voxel)
         meshes.append(mesh)
+    base = next((m for m, p in zip(meshes, obj.parts, strict=True) if p.joint is None), Mesh.empty())
+    for k, part in enumerate(obj.parts):
+        if part.joint is not None and part.joint.type == "prismatic" and len(meshes[k].faces) and len(base.faces):
+            motion = [start_motion(obj, k, 0.0), start_motion(obj, k, 1.0)]
+            poses = [motion[state] for state, _ in cameras]
+            meshes[k] = complete_tray(meshes[k], base, motion[1].numpy(), views, poses, voxel, TRUNCATION * voxel)
     return meshes
 
 

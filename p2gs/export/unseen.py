@@ -79,9 +79,9 @@ def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[T
             if _touching(area, (distance < NEAR * voxel).reshape(shape)) >= RIM:
                 colours = np.zeros((len(points), 3), mesh.colours.dtype)
                 colours[solid] = mesh.colours[tree.query(points[solid])[1]]
-                planes.append(_plane(points, area, colours, outward * (-1) ** axis))
+                planes.append(grid_plane(points, area, colours, outward * (-1) ** axis))
     for plane in planes:
-        mesh = _sewn(mesh, plane, NEAR * voxel)
+        mesh = sewn(mesh, plane, NEAR * voxel)
     return mesh
 
 
@@ -93,7 +93,7 @@ def _touching(area: np.ndarray, seen: np.ndarray) -> float:
     return float(binary_dilation(seen)[rim].mean()) if rim.any() else 0.0
 
 
-def _plane(points: np.ndarray, area: np.ndarray, colours: np.ndarray, sign: float) -> Mesh:
+def grid_plane(points: np.ndarray, area: np.ndarray, colours: np.ndarray, sign: float) -> Mesh:
     """Two triangles for each grid cell whose corners are all in ``area`` [a, b]; points, colours [a b, 3]. sign: which way it faces."""
     index = np.arange(area.size).reshape(area.shape)
     i, j = np.nonzero(area[:-1, :-1] & area[1:, :-1] & area[:-1, 1:] & area[1:, 1:])
@@ -111,7 +111,7 @@ def _open_vertices(faces: np.ndarray) -> np.ndarray:
     return np.unique(edges[first[np.bincount(which) == 1]])
 
 
-def _sewn(mesh: Mesh, plane: Mesh, reach: float) -> Mesh:
+def sewn(mesh: Mesh, plane: Mesh, reach: float) -> Mesh:
     """Both as one; the plane's rim takes the vertices of the mesh's open edges where these are within ``reach``."""
     from scipy.spatial import cKDTree
 

@@ -1,0 +1,115 @@
+"""Drawers whose rear no camera saw are completed as trays; what is no drawer, or was seen whole, is left as it was seen."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+from toy import ring
+
+from p2gs.data.furniture import box
+from p2gs.data.raytrace import trace
+from p2gs.data.textures import Texture
+from p2gs.export.depth_view import DepthView, add_normals
+from p2gs.export.trays import DEPTH, complete_tray, find_front
+from p2gs.export.tsdf import Mesh, fuse
+
+VOXEL = 0.02
+TRAVEL = 0.35
+PLAIN = Texture("noise", (0.6, 0.6, 0.6), (0.5, 0.5, 0.5), 0.2, 1)
+
+
+def boards(*corners):
+    return [box(a, b, PLAIN) for a, b in corners]
+
+
+# a body open to +x, and a drawer in it, shut
+BODY = boards(
+    ((-0.5, -0.4, -0.3), (-0.46, 0.4, 0.3)),
+    ((-0.5, -0.4, -0.3), (0.5, -0.36, 0.3)),
+    ((-0.5, 0.36, -0.3), (0.5, 0.4, 0.3)),
+    ((-0.5, -0.4, -0.3), (0.5, 0.4, -0.26)),
+    ((-0.5, -0.4, 0.26), (0.5, 0.4, 0.3)),
+)
+FRONT = ((0.5, -0.36, -0.2), (0.54, 0.36, 0.2))
+TRAY = (
+    FRONT,
+    ((-0.3, -0.32, -0.18), (0.5, -0.3, 0.1)),
+    ((-0.3, 0.3, -0.18), (0.5, 0.32, 0.1)),
+    ((-0.3, -0.32, -0.18), (0.5, 0.32, -0.16)),
+    ((-0.3, -0.32, -0.18), (-0.28, 0.32, 0.1)),
+)
+
+
+def moved(corners, by):
+    return [tuple((x + by, y, z) for x, y, z in pair) for pair in corners]
+
+
+def views_of(body, part, shifts, size=160):
+    """Views of the body (0) and the part (1) in each state, and the part's poses."""
+    views, poses = [], []
+    for by in shifts:
+        primitives = body + boards(*moved(part, by))
+        for c in ring(10, size, elevations=(15.0, 40.0)):
+            axis = (np.arange(c.width) + 0.5 - c.width / 2) / float(c.K[0, 0])
+            z, which = trace(primitives, c.viewmat.double().numpy(), c.K.double().numpy(), axis, axis)
+            hit = torch.from_numpy(np.isfinite(z))
+            labels = torch.where(hit, torch.from_numpy(which >= len(body)).long(), -1)
+            depth = torch.where(hit, torch.from_numpy(z), torch.zeros(z.shape))
+            views.append(add_normals(DepthView(c, depth, labels, torch.full((*z.shape, 3), 0.5)), 2 * VOXEL))
+            pose = torch.eye(4, dtype=torch.float64)
+            pose[0, 3] = by - shifts[0]
+            poses.append(pose)
+    return views, poses
+
+
+def completed(part, body=BODY, shifts=(0.0, TRAVEL)):
+    """The part's mesh as seen and as completed, both in the start state."""
+    views, poses = views_of(body, part, shifts)
+    still = [torch.eye(4, dtype=torch.float64)] * len(views)
+    seen, carcass = (fuse(views, p, k, VOXEL, 4 * VOXEL, 2 * VOXEL) for k, p in ((1, poses), (0, still)))
+    slide = np.eye(4)
+    slide[0, 3] = shifts[1] - shifts[0]
+    return seen, complete_tray(seen, carcass, slide, views, poses, VOXEL, 4 * VOXEL)
+
+
+@pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
+def test_a_drawer_gets_its_rear(shifts):
+    seen, whole = completed(TRAY, shifts=shifts)
+    truth = trimesh.util.concatenate([trimesh.creation.box(bounds=b) for b in moved(TRAY, shifts[0])])
+    points = truth.sample(4000, seed=0)
+    gap = [cKDTree(trimesh.Trimesh(m.vertices, m.faces, process=False).sample(8000, seed=0)).query(points)[0] for m in (seen, whole)]
+    assert gap[0].max() > 0.15 and gap[1].max() < 0.1
+    back, end = 0.5 + shifts[0], -0.5 + shifts[0]
+    assert whole.vertices[:, 0].min() == pytest.approx(back - DEPTH * (back - end), abs=2 * VOXEL)
+    assert whole.vertices[:, 2].max() == pytest.approx(seen.vertices[:, 2].max())  # nothing over its mouth
+    before, after = (trimesh.Trimesh(m.vertices, m.faces, process=False) for m in (seen, whole))
+    assert not ((after.triangles_center[:, 2] > 0.12) & (after.triangles_center[:, 0] < 0.4 + shifts[0])).any()
+    assert len(after.split(only_watertight=False)) <= len(before.split(only_watertight=False))  # sewn on
+
+
+def test_one_that_was_seen_whole_is_left_alone():
+    """A short tray comes out with its rear."""
+    short = [FRONT] + [tuple((max(x, 0.25) if x < 0.5 else x, y, z) for x, y, z in pair) for pair in TRAY[1:4]]
+    short.append(((0.25, -0.32, -0.18), (0.27, 0.32, 0.1)))
+    seen, whole = completed(short)
+    assert len(seen.faces) and whole is seen
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        (FRONT,),  # a lid
+        (FRONT, ((0.0, -0.3, -0.16), (0.5, 0.3, 0.16))),  # a block: nobody looks into it
+        (((-0.3, -0.02, -0.02), (0.6, 0.02, 0.02)),),  # a rod
+    ],
+)
+def test_what_is_no_drawer_is_left_alone(part):
+    seen, whole = completed(part)
+    assert len(seen.faces) and whole is seen
+
+
+def test_without_a_body_behind_it_nothing_is_known():
+    seen, whole = completed(TRAY, body=boards(((-0.5, -0.4, -0.4), (0.5, 0.4, -0.36))))
+    assert whole is seen
+    assert find_front(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((3, 3), np.uint8)), np.array([1.0, 0, 0]), VOXEL) is None
