@@ -14,6 +14,7 @@ from typing import Callable
 import torch
 from torch import Tensor
 
+from p2gs.models.boards import Rays, find_boards
 from p2gs.models.canonical import farthest_points
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import render_depths
@@ -30,6 +31,7 @@ from p2gs.types import GaussianTensors
 SOLID = 0.3  # opacity from which a Gaussian is surface
 TAU = 0.015  # tolerance along a ray, internal units
 SEEN = 0.05  # share of the other state's views that may see a Gaussian which that state does not confirm
+ALIKE = 0.9  # share of the most Gaussians that any backdrop lets give way from which on backdrops are held against the photographs
 COVER = 5.0  # pixels, all checked views together, that a patch must cover to be judged
 
 
@@ -40,6 +42,7 @@ class OpeningsConfig:
     may_lose: patches give way where the image error over each of them rises to no more than this times what it was; 0 = off. drawers: the
     same for patches of sliding parts, which have insides that go with them, as doors hardly do. rest: the same for patches most of whose
     neighbours gave way.
+    boards: whether flat boards inside (shelves, partitions, bottoms of drawers) are looked for, before which walls are not seen.
     patch: Gaussians a patch. looks, checks: views of a state from which rays are cast, and by which patches are judged; size: their
     long edge in pixels. apart: surfaces that the other state shows within this are confirmed by it; cell: grid of the walls; wall: their
     thickness (all internal units).
@@ -48,6 +51,7 @@ class OpeningsConfig:
     may_lose: float = 1.25
     drawers: float = 1.0
     rest: float = 1.6
+    boards: bool = True
     patch: int = 15
     looks: int = 64
     checks: int = 12
@@ -111,11 +115,11 @@ class OneState:
         g, camera, background = g.to(self.device), camera.to(self.device), background.to(self.device)
         return render_gaussians(g, camera, background, features=features, backend=self.backend)
 
-    def backdrop(self, walls: Walls, stacks: list[DepthStack]) -> Backdrop:
-        """Where rays that meet a lid meet the wall behind it, and the photograph's colour there."""
+    def rays(self, walls: Walls) -> Rays:
+        """Rays of the photographs through lids, from there to the wall behind; those that meet none are left out."""
         lids = torch.zeros(len(self.g), 1)
         lids[self.rows] = 1
-        places, colours, owners = [torch.zeros(0, 3)], [torch.zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)]
+        found = []
         for i in self.views.spread(self.config.looks):
             shot = self.views.get(i, self.level, torch.zeros(3))
             out = self.render(self.g, shot.camera, torch.zeros(3), lids)
@@ -125,17 +129,34 @@ class OneState:
             ray = torch.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], torch.ones(len(x), dtype=torch.float64)], 1)
             start = (ray * depth[y, x, None].double() - W[:3, 3]) @ W[:3, :3]
             way = torch.nn.functional.normalize(ray @ W[:3, :3], dim=1)
-            far = walls.meet(start, way)
-            place, found = self.inner_side(start + far.clamp_max(DEEPEST)[:, None] * way, way, stacks)
-            found &= far.isfinite()
-            places.append(place[found])
-            colours.append(shot.image[y, x][found])
-            owners.append(self.patch[knn(self.g.means[self.rows], start[found].float(), 1, False)[1][:, 0]])
-        place, cell = torch.cat(places), self.config.cell
+            patch = self.patch[knn(self.g.means[self.rows], start.float(), 1, False)[1][:, 0]]
+            found.append((start, way, walls.meet(start, way), shot.image[y, x], patch))
+        rays = Rays(*(torch.cat(x) for x in zip(*found, strict=True)))
+        return rays[rays.far.isfinite()]
+
+    def backdrops(self, walls: Walls, stacks: list[DepthStack]) -> list[Backdrop]:
+        """What rays that meet a lid may meet behind it: walls alone; boards before them, where photographs agree on these more than on
+        the lid; and where they do more than on the walls."""
+        rays, near = self.rays(walls), 2 * self.config.cell
+        wall, unseen = self.inner_side(rays.start + rays.far.clamp_max(DEEPEST)[:, None] * rays.way, rays.way, stacks)
+        out = [self.backdrop(rays, wall, unseen, 0)]
+        for stay in (True, False) if self.config.boards else ():
+            boards = find_boards(rays, walls.lo, walls.lo + walls.size * walls.cell, near, stay)
+            if boards:
+                t = torch.stack([b.meet(rays, near) for b in boards]).amin(0)
+                stopped = t.isfinite()
+                place = (rays.start + torch.where(stopped, t, 0.0)[:, None] * rays.way).float()
+                found = torch.where(stopped, self.unseen(place, stacks), unseen)
+                out.append(self.backdrop(rays, torch.where(stopped[:, None], place, wall), found, len(boards)))
+        return out
+
+    def backdrop(self, rays: Rays, place: Tensor, found: Tensor, boards: int) -> Backdrop:
+        """Points where the rays that ``found`` [R] one end, at ``place`` [R, 3], and the photographs' colours there."""
+        place, rays, cell = place[found], rays[found], self.config.cell
         voxels, where = torch.unique((place / cell).floor().long(), dim=0, return_inverse=True)
         n = torch.bincount(where, minlength=len(voxels))
         points = torch.zeros(len(voxels), 3).index_add_(0, where, place) / n.clamp_min(1)[:, None]
-        return Backdrop(points, where, torch.cat(colours), torch.cat(owners), cell)
+        return Backdrop(points, where, rays.colour, rays.patch, cell, boards)
 
     def inner_side(self, met: Tensor, way: Tensor, stacks: list[DepthStack]) -> tuple[Tensor, Tensor]:
         """Points [R, 3] before the walls that rays along ``way`` [R, 3] ``met`` [R, 3], at the first of a few depths that no view of either
@@ -143,20 +164,23 @@ class OneState:
         place, found = met.float(), torch.zeros(len(met), dtype=torch.bool)
         for factor in (1.0, 1.5, 2.0, 2.7):
             tried = (met - factor * self.config.wall * way).float()
-            unseen = torch.ones(len(met), dtype=torch.bool)
-            for stack in stacks:
-                free, on, behind = stack.counts(tried, TAU)
-                unseen &= (free + on == 0) & (behind > 0)
+            unseen = self.unseen(tried, stacks)
             place = torch.where((unseen & ~found)[:, None], tried, place)
             found |= unseen
         return place, found
 
-    def choose(self, backdrop: Backdrop) -> Tensor:
-        """Patches [K] bool that give way together.
+    @staticmethod
+    def unseen(points: Tensor, stacks: list[DepthStack]) -> Tensor:
+        """Which points [R, 3] are behind something in each state, and in no view before it or on it, [R] bool."""
+        out = torch.ones(len(points), dtype=torch.bool)
+        for stack in stacks:
+            free, on, behind = stack.counts(points, TAU)
+            out &= (free + on == 0) & (behind > 0)
+        return out
 
-        All go at first; while pixels of some are explained too much worse, the worst stays, or the worse half of those that fail by far.
-        What stayed because of others is tried once more, one by one, and at last what is left amid those that went: a lid is one surface.
-        """
+    def choose(self, backdrops: list[Backdrop]) -> tuple[Tensor, Backdrop]:
+        """Patches [K] bool that give way together, and their backdrop: the one with the least image error of those that let most of the
+        patches' Gaussians do so."""
         grey = torch.full((3,), 0.5)
         shots = [self.views.get(i, self.level, grey) for i in self.views.spread(self.config.checks)]
         onehot = torch.zeros(len(self.g), self.count)
@@ -172,14 +196,28 @@ class OneState:
 
         cover, was = weight.sum(1), over_patches(self.g)
 
-        def worse(chosen: Tensor) -> Tensor:
-            ratio = over_patches(self.without(chosen, backdrop)[0]) / (was * self.allowed).clamp_min(1e-9)
-            return torch.where(chosen, ratio, 0.0)
+        def giving_way(backdrop: Backdrop) -> Tensor:
+            def worse(chosen: Tensor, allowed: Tensor) -> Tensor:
+                ratio = over_patches(self.without(chosen, backdrop)[0]) / (was * allowed).clamp_min(1e-9)
+                return torch.where(chosen, ratio, 0.0)
 
-        judged = cover > COVER
-        chosen = judged & (torch.bincount(backdrop.patch, minlength=self.count) > 0)
+            return self.give_way(cover > COVER, torch.bincount(backdrop.patch, minlength=self.count) > 0, worse)
+
+        tried = [(giving_way(b), b) for b in backdrops]
+        gone = [int(chosen[self.patch].sum()) for chosen, _ in tried]
+        good = [outcome for outcome, n in zip(tried, gone, strict=True) if n >= ALIKE * max(gone)]
+        return min(good, key=lambda outcome: float(over_patches(self.without(*outcome)[0]).sum()))
+
+    def give_way(self, judged: Tensor, met: Tensor, worse: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Patches [K] bool that give way together, of those ``judged`` [K] bool.
+
+        All behind which rays ``met`` [K] bool something go at first; while pixels of some are explained too much ``worse``, the worst
+        stays, or the worse half of those that fail by far. What stayed because of others is tried once more, one by one, and at last what
+        is left amid those that went: a lid is one surface.
+        """
+        chosen, allowed = judged & met, self.allowed
         while chosen.any():
-            ratio = worse(chosen)
+            ratio = worse(chosen, allowed)
             if float(ratio.max()) <= 1:
                 break
             failed = int((ratio > 2).sum())
@@ -187,11 +225,11 @@ class OneState:
         if not chosen.any():
             return chosen
         for k in (judged & ~chosen).nonzero().squeeze(1).tolist():
-            chosen = self.with_one_more(chosen, k, worse)
+            chosen = self.with_one_more(chosen, k, lambda c: worse(c, allowed))
         amid = judged & ~chosen & self.surrounded(chosen)
-        self.allowed = torch.where(amid, self.config.rest, self.allowed)
+        allowed = torch.where(amid, self.config.rest, allowed)
         for k in amid.nonzero().squeeze(1).tolist():
-            chosen = self.with_one_more(chosen, k, worse)
+            chosen = self.with_one_more(chosen, k, lambda c: worse(c, allowed))
         return chosen
 
     @staticmethod
@@ -238,7 +276,7 @@ def open_up(
     away = (motions.transforms, se3.inverse(motions.transforms))
     g = [s.gaussians for s in states]
     solid = [torch.sigmoid(x.opacity_logits) > SOLID for x in g]
-    counted = [{"unconfirmed": 0, "patches": 0, "gave_way": 0, "removed": 0, "added": 0} for _ in states]
+    counted = [{"unconfirmed": 0, "patches": 0, "boards": 0, "gave_way": 0, "removed": 0, "added": 0} for _ in states]
     out = [Opening(torch.ones(len(x), dtype=torch.bool), x[:0]) for x in g]
     if min(int(k.sum()) for k in solid) < config.patch:  # no object: fusion says so
         return out, motions, stacks, counted
@@ -253,9 +291,8 @@ def open_up(
         if int((lids[s] & solid[s]).sum()) < config.patch:
             continue
         state = OneState(g[s], lids[s], slides[motions.labels[s]], views[s], config, backend, device)
-        backdrop = state.backdrop(walls, stacks)
-        chosen = state.choose(backdrop)
-        counted[s] |= {"patches": state.count, "gave_way": int(chosen.sum())}
+        chosen, backdrop = state.choose(state.backdrops(walls, stacks))
+        counted[s] |= {"patches": state.count, "boards": backdrop.boards, "gave_way": int(chosen.sum())}
         if not chosen.any():
             continue
         new, kept, near = state.without(chosen, backdrop)

@@ -60,13 +60,15 @@ class Walls:
 
 @dataclass
 class Backdrop:
-    """The inner sides of walls that rays through patches meet. points [P, 3]; of each ray its point [R], colour [R, 3] and patch [R]."""
+    """What rays through patches meet behind them. points [P, 3]; of each ray its point [R], colour [R, 3] and patch [R]; boards: how many
+    were found between the patches and the walls."""
 
     points: Tensor
     where: Tensor
     colours: Tensor
     patch: Tensor
     cell: float
+    boards: int = 0
 
     def paint(self, chosen: Tensor) -> tuple[Tensor, Tensor]:
         """Mean colour [P, 3] of the rays through the patches ``chosen`` [K] bool, and which points one fell on [P]."""
