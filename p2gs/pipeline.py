@@ -27,6 +27,7 @@ from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.finish import finish
 from p2gs.models.openings import open_up
+from p2gs.models.owners import hidden_to_owners
 from p2gs.models.part_motions import find_part_motions
 from p2gs.models.phase import Phase
 from p2gs.models.sharpen import SharpenPhase
@@ -228,20 +229,23 @@ class Pipeline:
 
     def fusion(self, found_in, states, motions, section) -> Phase:
         """found_in: the states before they were sharpened: an overfitted lid explains noise that no wall behind it does."""
-        stacks = counted = None
+        stacks, counted = None, {}
         if motions is not None and len(motions) and section.config.canonical.free_space > 0:
             found, backend = self.cfg.phases["discovery"].config, {"backend": self.cfg.rasterizer, "device": self.device}
             size = (found.evidence_size, found.min_opacity)
             train = [self.scene.select(state=s.state, split="train") for s in states]
             seen = [gather_evidence(s.gaussians, v, *size, **backend) for s, v in zip(found_in, train, strict=True)]
             stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in seen]
+            if section.config.owners:
+                motions, counted["owners"] = hidden_to_owners(found_in, motions, stacks, **backend)
             told = any(v.depth is not None for views in train for v in views)  # where depth is given nothing is open
             if section.config.openings.may_lose > 0 and not told:
-                openings, motions, stacks, counted = open_up(found_in, motions, self.views, stacks, section.config.openings, **backend)
+                openings, motions, stacks, lids = open_up(found_in, motions, self.views, stacks, section.config.openings, **backend)
                 states = [opening.of(s) for opening, s in zip(openings, states, strict=True)]
-                gone, come = (sum(c[k] for c in counted) for k in ("removed", "added"))
+                counted["openings"] = lids
+                gone, come = (sum(c[k] for c in lids) for k in ("removed", "added"))
                 print(f"canonical_fusion: {gone} Gaussians before openings gave way to {come} on the walls behind them", flush=True)
-        options = {"stacks": stacks, "openings": counted, **self.common()}
+        options = {"stacks": stacks, "counted": counted, **self.common()}
         return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, **options)
 
     def articulate(self, canonical, states, motions, section) -> Phase:

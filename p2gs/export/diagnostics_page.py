@@ -155,8 +155,11 @@ def _fusion(d: dict) -> list[str]:
     rows = [[f"{chip(k)}{k}", f"{n:,}", f"{m:,}"] for k, (n, m) in enumerate(zip(f["gaussians"], f["matched"], strict=True))]
     text = f"canonical time {f['canonical_time']:.3f}; contradicted by free space: "
     text += f"relabelled {_count(f['relabelled'])}, dropped {_count(f['dropped'])}"
+    if any(f.get("owners") or []):
+        text += f"; {sum(f['owners']):,} went to the part that hides them in the other state"
     for state, o in zip(("start", "end"), f.get("openings") or [], strict=False):
         text += f"; {state}: {o['unconfirmed']:,} that the other state says nothing of, {o['removed']:,} gave way to the walls behind"
+        text += f" and {o['boards']} boards before these" if o.get("boards") else ""
     return [table(["part of discovery", "Gaussians", "with a partner in the other state"], rows), f'<p class="soft">{text}</p>']
 
 

@@ -25,14 +25,16 @@ SURFACE = 0.015  # tolerance of rendered depth (internal units): nearer than thi
 
 @dataclass
 class CanonicalFusionConfig(ImageConfig):
-    """Options of fusion and its fine-tuning. steps: paper 5,000. canonical: how the two states are joined. openings: what becomes of
-    surfaces that only one state shows and that nothing fixes in depth."""
+    """Options of fusion and its fine-tuning. steps: paper 5,000. canonical: how the two states are joined. owners: whether what one state
+    hides of moving parts goes to the part that hides it. openings: what becomes of surfaces that only one state shows and that nothing
+    fixes in depth."""
 
     steps: int = 500
     levels: list[int] = field(default_factory=lambda: [200, 400])
     level_starts: list[float] = field(default_factory=lambda: [0.0, 0.3])
     rates: SplatRates = field(default_factory=lambda: SplatRates(2e-4, 2e-5, 2e-3, 2e-2, 1e-3, 2.5e-3, 2.5e-4))
     canonical: CanonicalConfig = field(default_factory=CanonicalConfig)
+    owners: bool = True
     openings: OpeningsConfig = field(default_factory=OpeningsConfig)
 
 
@@ -50,7 +52,7 @@ class CanonicalFusionPhase(ImagePhase):
         motions: PartMotions | None,
         views,
         stacks: list[DepthStack] | None = None,
-        openings: list[dict] | None = None,
+        counted: dict | None = None,
         **common,
     ):
         super().__init__(config, losses, views, **common)
@@ -71,7 +73,7 @@ class CanonicalFusionPhase(ImagePhase):
         if fused.offsets is not None:
             carried["offsets"] = fused.offsets
         self.splats = Splats(fused.gaussians, carried=carried)
-        self.counted = fused.diagnostics if openings is None else {**fused.diagnostics, "openings": openings}
+        self.counted = {**fused.diagnostics, **(counted or {})}
         self.moves: list[RigidMoves] | None = None  # made when labels are where they stay
         self.register_buffer("betas", fused.betas)
         self.register_buffer("transforms", transforms)

@@ -210,6 +210,7 @@ def fusion(canonical: CanonicalGaussians, time: float) -> dict:
         "matched": matched.tolist(),
         "relabelled": canonical.diagnostics.get("relabelled"),
         "dropped": canonical.diagnostics.get("dropped"),
+        "owners": canonical.diagnostics.get("owners"),
         "openings": canonical.diagnostics.get("openings"),
     }
 

@@ -10,7 +10,8 @@ from p2gs.data.views import TrainingViews
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.openings import OpeningsConfig, open_up, patches, unconfirmed
+from p2gs.models.openings import OpeningsConfig, open_up, unconfirmed
+from p2gs.models.patches import patches
 from p2gs.models.walls import Backdrop, Walls, over_surface
 from p2gs.ops import se3
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
