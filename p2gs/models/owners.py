@@ -2,7 +2,8 @@
 
 The inside of a drawer is seen when the drawer is open. Shut, its own front hides it, under any motion that carries it back, so the other
 state cannot tell whether it went with this drawer, the one below or a door. But it can tell what it lies behind. Doors hardly have
-insides that go with them: what lies behind a door stays whose it was.
+insides that go with them: what lies behind a door stays whose it was. What its part hides from no view, and what is as hidden where it
+is, need not have moved.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from p2gs.types import GaussianTensors
 TAU = 0.015  # tolerance along a ray, internal units
 SEEN = 0.05  # share of the views that may see what counts as hidden
 CLEARLY = 2.0  # times as often as the part it was given to must another hide it
+NEVER = 0.01  # share of the views below which a part hides a thing in none
 PATCH = 15  # Gaussians that change together, in the mean
 LEAST = 0.1  # share of the views in which that one must
 
@@ -73,14 +75,14 @@ def owners(
 
     labels [N]; transforms [K-1, 4, 4] to the other state; stack, maps: its rendered depth and ``label_maps``.  rows [M]: Gaussians that may
     change, in ``groups`` [M] that change together: from a moving part to another one, of the ``takers`` [K] bool, that hides them, carried
-    by its motion, ``CLEARLY`` more often.
+    by its motion, ``CLEARLY`` more often; or to the base, under which they are hidden, too, from one that hides them from no view.
     """
     T = with_static(transforms).to(g.means)
     count, n = len(T), int(groups.max()) + 1 if len(groups) else 0
     share = torch.zeros(n, count)
     seen = torch.zeros(n, count)
     total = torch.zeros(n, count)
-    for k in range(1, count):
+    for k in range(count):
         hidden, visible = hiders(se3.apply(T[k], g.means[rows]), stack, maps, count)
         share[:, k].index_add_(0, groups, hidden[:, k])
         seen[:, k].index_add_(0, groups, visible)
@@ -91,9 +93,13 @@ def owners(
     best = torch.where((seen <= SEEN) & takers, share, 0.0)[:, 1:].max(1)
     mine = share[torch.arange(n), now]
     change = (now > 0) & (best.indices + 1 != now) & (best.values > LEAST) & (best.values > CLEARLY * mine)
+    taker = torch.where(change, best.indices + 1, now)
+    # hidden by others alone, and as well where it is: it need not have moved
+    still = (now > 0) & ~change & (mine < NEVER) & (seen[:, 0] <= SEEN) & (total[:, 0] > 0)
+    taker = torch.where(still, 0, taker)
     out = labels.clone()
-    moved = change[groups] & (labels[rows] > 0)
-    out[rows[moved]] = best.indices[groups[moved]] + 1
+    moved = (change | still)[groups] & (labels[rows] > 0)
+    out[rows[moved]] = taker[groups[moved]]
     return out
 
 
@@ -108,8 +114,6 @@ def hidden_to_owners(
     count, labels = len(motions.transforms) + 1, list(motions.labels)
     changed = [0, 0]
     takers = torch.tensor([False] + [kind == "prismatic" for kind in motions.types])
-    if count < 3 or not takers.any():
-        return motions, changed
     for s, away in enumerate((motions.transforms, se3.inverse(motions.transforms))):
         g, other = states[s].gaussians, stacks[1 - s]
         free, on, behind = other.counts(landed(g.means, labels[s], away), TAU)

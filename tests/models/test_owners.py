@@ -72,6 +72,20 @@ def test_what_belongs_to_the_base_or_is_seen_stays():
     assert torch.equal(owners(shown, motions.labels[1], away, stacks[0], maps, one, rows, takers), motions.labels[1])
 
 
+def test_what_its_part_never_hides_need_not_have_moved():
+    states, motions, stacks, sizes = chest()
+    maps = label_maps(states[0].gaussians, torch.zeros_like(motions.labels[0]), 3, stacks[0], "auto", "cpu")  # all of it the base's
+    g, away = states[1].gaussians, se3.inverse(motions.transforms)
+    inside = g.placed(g.means - torch.tensor([0.0, 0.18, 0.0]), g.quats)  # the floors, hidden where they are as well
+    rows = torch.arange(len(g) - sizes[-1], len(g))
+    rows = rows[(inside.means[rows, 1] > 0.0) & (inside.means[rows, 1] < 0.25)]
+    group, takers = torch.zeros(len(rows), dtype=torch.int64), torch.tensor([False, True, True])
+    assert len(rows) > 20 and (owners(inside, motions.labels[1], away, stacks[0], maps, group, rows, takers)[rows] == 0).all()
+    out = g.placed(g.means + torch.tensor([0.0, 0.3, 0.0]), g.quats)  # hidden once carried back as far, but seen to be empty where they are
+    away[:, 1, 3] -= 0.45
+    assert (owners(out, motions.labels[1], away, stacks[0], maps, group, rows, takers)[rows] == 1).all()
+
+
 def test_what_views_see_before_a_point():
     states, motions, stacks, _ = chest()
     maps = label_maps(states[0].gaussians, motions.labels[0], 3, stacks[0], "auto", "cpu")
