@@ -211,7 +211,8 @@ def find_tray(mesh: Mesh, body: Mesh, outward: np.ndarray, travel: float, eyes: 
 def complete_tray(
     mesh: Mesh, body: Mesh, slide: np.ndarray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float, clearance: float
 ) -> Mesh:
-    """The mesh of what was seen of a sliding part, with the sides, bottom and rear of its tray where nothing was seen (``find_tray``).
+    """The mesh of what was seen of a sliding part, with the sides, bottom and rear of its tray where nothing was seen (``find_tray``), and
+    without what is not the tray's.
 
     body: what it slides into.  slide [4, 4]: its motion from the start state, in which both meshes stand, to the end.  views, poses, voxel,
     clearance: as in ``close_unseen_sides``, of the sliding part.
@@ -227,6 +228,7 @@ def complete_tray(
     tray = find_tray(mesh, body, outward, travel, eyes_of(views, poses), voxel)
     if tray is None:
         return mesh
+    mesh = _without_strays(mesh, tray, NEAR * voxel)
     seen, colours = cKDTree(mesh.vertices), mesh.colours
     for axis, e in ((1, 0), (1, 1), (2, 0), (2, 1), (0, 0)):
         if (axis - 1, e) == tray.mouth:
@@ -242,6 +244,15 @@ def complete_tray(
         if len(plate.faces):
             mesh = sewn(mesh, plate, NEAR * voxel)
     return mesh
+
+
+def _without_strays(mesh: Mesh, tray: Tray, reach: float) -> Mesh:
+    """The mesh without what lies behind the front and farther than ``reach`` outside the tray, but before its mouth: another part's."""
+    middle = Faces(mesh, tray.front.axes).middle
+    outside = np.stack([tray.lo[1:] - middle[:, 1:], middle[:, 1:] - tray.hi[1:]], 2) > reach
+    outside[:, tray.mouth[0], tray.mouth[1]] = False
+    stray = (middle[:, 0] < tray.front.back - reach) & outside.any((1, 2))
+    return Mesh(mesh.vertices, mesh.faces[~stray], mesh.colours).without_unused() if stray.any() else mesh
 
 
 def _centre(mesh: Mesh) -> np.ndarray:

@@ -88,6 +88,14 @@ def test_a_drawer_gets_its_rear(shifts):
     assert len(after.split(only_watertight=False)) <= len(before.split(only_watertight=False))  # sewn on
 
 
+def test_what_is_beside_the_tray_is_not_its():
+    """A board below the bottom, labelled the drawer's, goes; what stands out of the mouth stays."""
+    bottom, top = ((0.2, -0.3, -0.38), (0.36, 0.3, -0.36)), ((0.2, -0.05, -0.16), (0.3, 0.05, 0.18))
+    seen, whole = completed((*TRAY, bottom, top))
+    before, after = ((m.vertices[:, 2] < -0.3, m.vertices[:, 2] > 0.15) for m in (seen, whole))
+    assert before[0].any() and not after[0].any() and before[1].any() and after[1].any()
+
+
 def test_one_that_was_seen_whole_is_left_alone():
     """A short tray comes out with its rear."""
     short = [FRONT] + [tuple((max(x, 0.25) if x < 0.5 else x, y, z) for x, y, z in pair) for pair in TRAY[1:4]]
