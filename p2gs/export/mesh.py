@@ -122,20 +122,18 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
         view = add_normals(DepthView(camera, seen.depth, seen.label, seen.colour), edge=EDGE * voxel)
         view.cosine = view.cosine * trust(seen, limit)
         views.append(view)
+    motions = [[start_motion(obj, k, 0.0), start_motion(obj, k, 1.0)] for k in range(len(obj.parts))]
+    poses = [[motion[state] for state, _ in cameras] for motion in motions]
     meshes = []
     for k, part in enumerate(obj.parts):
-        motion = [start_motion(obj, k, 0.0), start_motion(obj, k, 1.0)]
-        poses = [motion[state] for state, _ in cameras]
-        mesh = largest_components(fuse(views, poses, k, voxel, trunc=TRUNCATION * voxel, behind=BEHIND * voxel))
+        mesh = largest_components(fuse(views, poses[k], k, voxel, trunc=TRUNCATION * voxel, behind=BEHIND * voxel))
         if part.joint is None:
-            mesh = close_unseen_sides(mesh, views, poses, k, voxel, TRUNCATION * voxel)
+            mesh = close_unseen_sides(mesh, views, poses[k], k, voxel, TRUNCATION * voxel)
         meshes.append(mesh)
     base = next((m for m, p in zip(meshes, obj.parts, strict=True) if p.joint is None), Mesh.empty())
     for k, part in enumerate(obj.parts):
         if part.joint is not None and part.joint.type == "prismatic" and len(meshes[k].faces) and len(base.faces):
-            motion = [start_motion(obj, k, 0.0), start_motion(obj, k, 1.0)]
-            poses = [motion[state] for state, _ in cameras]
-            meshes[k] = complete_tray(meshes[k], base, motion[1].numpy(), views, poses, voxel, TRUNCATION * voxel)
+            meshes[k] = complete_tray(meshes[k], base, motions[k][1].numpy(), views, poses[k], voxel, TRUNCATION * voxel)
     return meshes
 
 

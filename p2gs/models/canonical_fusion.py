@@ -10,7 +10,7 @@ from torch import Tensor
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.canonical import CanonicalConfig, fuse, keep_rows, with_static
 from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.free_space import explain_by_free_space, hidden_share
+from p2gs.models.free_space import SURFACE, explain_by_free_space, hidden_share
 from p2gs.models.handover import CanonicalGaussians, PartMotions, StateGaussians
 from p2gs.models.openings import OpeningsConfig
 from p2gs.models.phase import register_phase
@@ -19,8 +19,6 @@ from p2gs.models.splats import Splats
 from p2gs.ops import se3
 from p2gs.ops.carry import RigidMoves
 from p2gs.types import GaussianTensors
-
-SURFACE = 0.015  # tolerance of rendered depth (internal units): nearer than this to a surface is on it
 
 
 @dataclass

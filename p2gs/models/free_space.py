@@ -13,6 +13,8 @@ from p2gs.models.canonical import with_static
 from p2gs.models.discovery.evidence import DepthStack, classify
 from p2gs.ops import se3
 
+SURFACE = 0.015  # tolerance of rendered depth (internal units): nearer than this to a surface is on it
+SEEN = 0.05  # share of the views that may see what counts as hidden
 
 @torch.no_grad()
 def explain_by_free_space(
@@ -74,3 +76,10 @@ def hidden_share(means: Tensor, labels: Tensor, transforms: Tensor, stack: Depth
     """
     free, on, behind = stack.counts(landed(means, labels, transforms), tau)
     return behind / (free + on + behind).clamp_min(1)
+
+
+@torch.no_grad()
+def out_of_sight(points: Tensor, stack: DepthStack) -> Tensor:
+    """Which points [N, 3] are behind something in some view of a state, and in ``SEEN`` of them at most before it or on it, [N] bool."""
+    free, on, behind = stack.counts(points, SURFACE)
+    return (behind > 0) & (free + on <= SEEN * (free + on + behind))

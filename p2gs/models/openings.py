@@ -17,7 +17,7 @@ from torch import Tensor
 from p2gs.models.boards import Rays, find_boards
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import render_depths
-from p2gs.models.free_space import landed
+from p2gs.models.free_space import SURFACE, landed, out_of_sight
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.patches import patches
 from p2gs.models.single_state import render_gaussians
@@ -28,8 +28,6 @@ from p2gs.render.base import MAX_FEATURES
 from p2gs.types import GaussianTensors
 
 SOLID = 0.3  # opacity from which a Gaussian is surface
-TAU = 0.015  # tolerance along a ray, internal units
-SEEN = 0.05  # share of the other state's views that may see a Gaussian which that state does not confirm
 ALIKE = 0.9  # share of the most Gaussians that any backdrop lets give way from which on backdrops are held against the photographs
 COVER = 5.0  # pixels, all checked views together, that a patch must cover to be judged
 
@@ -76,10 +74,8 @@ def unconfirmed(g: GaussianTensors, labels: Tensor, transforms: Tensor, other: G
     """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its views see, and farther
     than ``apart`` from its surfaces.  transforms [K-1, 4, 4] to the other state; stack: its rendered depth."""
     at = landed(g.means, labels, transforms)
-    free, on, behind = stack.counts(at, TAU)
-    hidden = (behind > 0) & (free + on <= SEEN * (free + on + behind))
     solid = torch.sigmoid(other.opacity_logits) > SOLID
-    return hidden & (knn(other.means[solid], at, 1, False)[0][:, 0] > apart)
+    return out_of_sight(at, stack) & (knn(other.means[solid], at, 1, False)[0][:, 0] > apart)
 
 
 class OneState:
@@ -158,7 +154,7 @@ class OneState:
         """Which points [R, 3] are behind something in each state, and in no view before it or on it, [R] bool."""
         out = torch.ones(len(points), dtype=torch.bool)
         for stack in stacks:
-            free, on, behind = stack.counts(points, TAU)
+            free, on, behind = stack.counts(points, SURFACE)
             out &= (free + on == 0) & (behind > 0)
         return out
 
@@ -284,7 +280,7 @@ def open_up(
         depth[s] = DepthStack(*render_depths(new, cameras, backend, device), cameras)
         seen = torch.ones(len(new), dtype=torch.bool)
         n = int(kept.sum())
-        seen[n:] = near | (depth[s].counts(new.means[n:], TAU)[1] > 0)
+        seen[n:] = near | (depth[s].counts(new.means[n:], SURFACE)[1] > 0)
         extra = int(seen.sum() - kept.sum())
         counted[s] |= {"removed": int((~kept).sum()), "added": extra}
         out[s] = Opening(kept, new[n:][seen[n:]])

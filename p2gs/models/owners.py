@@ -15,7 +15,7 @@ from torch import Tensor
 
 from p2gs.models.canonical import with_static
 from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.free_space import landed
+from p2gs.models.free_space import SEEN, SURFACE, landed, out_of_sight
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.patches import patches
 from p2gs.models.single_state import render_gaussians
@@ -24,8 +24,6 @@ from p2gs.ops.blend import likeliest
 from p2gs.render.base import MAX_FEATURES
 from p2gs.types import GaussianTensors
 
-TAU = 0.015  # tolerance along a ray, internal units
-SEEN = 0.05  # share of the views that may see what counts as hidden
 CLEARLY = 2.0  # times as often as the part it was given to must another hide it
 NEVER = 0.01  # share of the views below which a part hides a thing in none
 PATCH = 15  # Gaussians that change together, in the mean
@@ -33,32 +31,26 @@ LEAST = 0.1  # share of the views in which that one must
 
 
 @torch.no_grad()
-def label_maps(g: GaussianTensors, labels: Tensor, count: int, stack: DepthStack, backend: str, device) -> list[Tensor]:
-    """What part covers most of each pixel of the stack's views, [H, W] int64 each. labels [N] in 0..count-1."""
+def label_maps(g: GaussianTensors, labels: Tensor, count: int, stack: DepthStack, backend: str, device) -> Tensor:
+    """What part covers most of each pixel of the stack's views, [V, H, W] int64. labels [N] in 0..count-1."""
     chunks = torch.nn.functional.one_hot(labels, count).float().split(MAX_FEATURES, 1)
-    g, maps = g.to(device), []
-    for camera in stack.cameras:
+    g, maps = g.to(device), torch.zeros(stack.depth.shape, dtype=torch.int64)
+    for out, camera in zip(maps, stack.cameras, strict=True):
         shares = [render_gaussians(g, camera.to(device), features=c.to(device), backend=backend).features.cpu() for c in chunks]
         share = torch.cat(shares, -1)
-        maps.append(likeliest(share.flatten(0, 1)).reshape(share.shape[:2]))
+        out[: camera.height, : camera.width] = likeliest(share.flatten(0, 1)).reshape(share.shape[:2])
     return maps
 
 
-def hiders(points: Tensor, stack: DepthStack, maps: list[Tensor], count: int) -> tuple[Tensor, Tensor]:
-    """How often each part is what a view sees before each point, [N, count]; and how many views see the point or past it, [N]."""
-    hidden, open_ = torch.zeros(len(points), count), torch.zeros(len(points))
-    rows = torch.arange(len(points))
-    for v, labels in enumerate(maps):
-        local = points @ stack.viewmat[v, :3, :3].T + stack.viewmat[v, :3, 3]
-        z = local[:, 2]
-        pixel = (local @ stack.K[v].T)[:, :2] / z.clamp_min(1e-6)[:, None]
-        height, width = labels.shape
-        inside = (z > 1e-3) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
-        x, y = pixel[:, 0].long().clamp(0, width - 1), pixel[:, 1].long().clamp(0, height - 1)
-        behind = inside & stack.valid[v, y, x] & (stack.far[v, y, x] < z - TAU)
-        hidden.index_put_((rows[behind], labels[y, x][behind]), torch.ones(int(behind.sum())), accumulate=True)
-        open_ += inside & ~behind
-    return hidden, open_
+def hiders(points: Tensor, stack: DepthStack, maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """How often each part is what a view sees before each point, [N, count]; and how many views see the point or past it, [N].
+
+    maps [V, H, W]: what part the stack's first views see.
+    """
+    z, pixel, inside = stack.project(points, torch.arange(len(maps)))
+    behind = inside & stack.valid.reshape(-1)[pixel] & (stack.far.reshape(-1)[pixel] < z - SURFACE)
+    hidden = torch.zeros(len(points), count).scatter_add_(1, maps.reshape(-1)[pixel], behind.float())
+    return hidden, (inside & ~behind).float().sum(1)
 
 
 def owners(
@@ -66,7 +58,7 @@ def owners(
     labels: Tensor,
     transforms: Tensor,
     stack: DepthStack,
-    maps: list[Tensor],
+    maps: Tensor,
     groups: Tensor,
     rows: Tensor,
     takers: Tensor,
@@ -116,8 +108,7 @@ def hidden_to_owners(
     takers = torch.tensor([False] + [kind == "prismatic" for kind in motions.types])
     for s, away in enumerate((motions.transforms, se3.inverse(motions.transforms))):
         g, other = states[s].gaussians, stacks[1 - s]
-        free, on, behind = other.counts(landed(g.means, labels[s], away), TAU)
-        rows = ((labels[s] > 0) & (behind > 0) & (free + on <= SEEN * (free + on + behind))).nonzero().squeeze(1)
+        rows = ((labels[s] > 0) & out_of_sight(landed(g.means, labels[s], away), other)).nonzero().squeeze(1)
         if len(rows) == 0:
             continue
         maps = label_maps(states[1 - s].gaussians, motions.labels[1 - s], count, other, backend, device)

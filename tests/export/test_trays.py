@@ -6,31 +6,14 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 from toy import ring
+from traced import CRATE as BODY
+from traced import boards, seen
 
-from p2gs.data.furniture import box
-from p2gs.data.raytrace import trace
-from p2gs.data.textures import Texture
-from p2gs.export.depth_view import DepthView, add_normals
 from p2gs.export.trays import DEPTH, complete_tray, find_front
 from p2gs.export.tsdf import Mesh, fuse
 
 VOXEL = 0.02
 TRAVEL = 0.35
-PLAIN = Texture("noise", (0.6, 0.6, 0.6), (0.5, 0.5, 0.5), 0.2, 1)
-
-
-def boards(*corners):
-    return [box(a, b, PLAIN) for a, b in corners]
-
-
-# a body open to +x, and a drawer in it, shut
-BODY = boards(
-    ((-0.5, -0.4, -0.3), (-0.46, 0.4, 0.3)),
-    ((-0.5, -0.4, -0.3), (0.5, -0.36, 0.3)),
-    ((-0.5, 0.36, -0.3), (0.5, 0.4, 0.3)),
-    ((-0.5, -0.4, -0.3), (0.5, 0.4, -0.26)),
-    ((-0.5, -0.4, 0.26), (0.5, 0.4, 0.3)),
-)
 FRONT = ((0.5, -0.36, -0.2), (0.54, 0.36, 0.2))
 TRAY = (
     FRONT,
@@ -51,12 +34,7 @@ def views_of(body, part, shifts, size=160):
     for by in shifts:
         primitives = body + boards(*moved(part, by))
         for c in ring(10, size, elevations=(15.0, 40.0)):
-            axis = (np.arange(c.width) + 0.5 - c.width / 2) / float(c.K[0, 0])
-            z, which = trace(primitives, c.viewmat.double().numpy(), c.K.double().numpy(), axis, axis)
-            hit = torch.from_numpy(np.isfinite(z))
-            labels = torch.where(hit, torch.from_numpy(which >= len(body)).long(), -1)
-            depth = torch.where(hit, torch.from_numpy(z), torch.zeros(z.shape))
-            views.append(add_normals(DepthView(c, depth, labels, torch.full((*z.shape, 3), 0.5)), 2 * VOXEL))
+            views.append(seen(primitives, len(body), c, 2 * VOXEL))
             pose = torch.eye(4, dtype=torch.float64)
             pose[0, 3] = by - shifts[0]
             poses.append(pose)
@@ -67,10 +45,10 @@ def completed(part, body=BODY, shifts=(0.0, TRAVEL)):
     """The part's mesh as seen and as completed, both in the start state."""
     views, poses = views_of(body, part, shifts)
     still = [torch.eye(4, dtype=torch.float64)] * len(views)
-    seen, carcass = (fuse(views, p, k, VOXEL, 4 * VOXEL, 2 * VOXEL) for k, p in ((1, poses), (0, still)))
+    mesh, carcass = (fuse(views, p, k, VOXEL, 4 * VOXEL, 2 * VOXEL) for k, p in ((1, poses), (0, still)))
     slide = np.eye(4)
     slide[0, 3] = shifts[1] - shifts[0]
-    return seen, complete_tray(seen, carcass, slide, views, poses, VOXEL, 4 * VOXEL)
+    return mesh, complete_tray(mesh, carcass, slide, views, poses, VOXEL, 4 * VOXEL)
 
 
 @pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])

@@ -7,32 +7,15 @@ import pytest
 import torch
 import trimesh
 from toy import ring
+from traced import CRATE, boards, seen
 
-from p2gs.data.furniture import box
-from p2gs.data.raytrace import trace
-from p2gs.data.textures import Texture
-from p2gs.export.depth_view import DepthView, add_normals
 from p2gs.export.tsdf import Mesh, fuse
 from p2gs.export.unseen import close_unseen_sides, eyes_of, facing, seen_empty
 
 EYE = torch.eye(4, dtype=torch.float64)
 VOXEL = 0.03
-PLAIN = Texture("noise", (0.6, 0.6, 0.6), (0.5, 0.5, 0.5), 0.2, 1)
-
-
-def boards(*corners):
-    return [box(a, b, PLAIN) for a, b in corners]
-
 
 BLOCK = boards(((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3)))
-# an open box that stands on its side, its mouth to +x: its floor is seen from within
-CRATE = boards(
-    ((-0.5, -0.4, -0.3), (-0.46, 0.4, 0.3)),
-    ((-0.5, -0.4, -0.3), (0.5, -0.36, 0.3)),
-    ((-0.5, 0.36, -0.3), (0.5, 0.4, 0.3)),
-    ((-0.5, -0.4, -0.3), (0.5, 0.4, -0.26)),
-    ((-0.5, -0.4, 0.26), (0.5, 0.4, 0.3)),
-)
 # a table: space between its legs is seen, and its legs are no rim
 TABLE = boards(
     ((-0.5, -0.4, 0.1), (0.5, 0.4, 0.15)),
@@ -42,15 +25,7 @@ TABLE = boards(
 
 def look(primitives, cameras, lids=0):
     """Views of boards, the last ``lids`` of which are another part's."""
-    views = []
-    for c in cameras:
-        K, axis = c.K.double().numpy(), (np.arange(c.width) + 0.5 - c.width / 2) / float(c.K[0, 0])
-        z, which = trace(primitives, c.viewmat.double().numpy(), K, axis, axis)
-        hit = torch.from_numpy(np.isfinite(z))
-        labels = torch.from_numpy(which >= len(primitives) - lids).long()
-        depth = torch.where(hit, torch.from_numpy(z), torch.zeros(z.shape))
-        views.append(add_normals(DepthView(c, depth, torch.where(hit, labels, -1), torch.full((*z.shape, 3), 0.5)), 2 * VOXEL))
-    return views
+    return [seen(primitives, len(primitives) - lids, c, 2 * VOXEL) for c in cameras]
 
 
 def closed(primitives, elevations=(15.0, 40.0), lids=0):
