@@ -2,7 +2,7 @@
 
 A mesh from photographs is open where nobody looked. A side of its bounding box which no camera faced is closed by a plane where space
 just inside was never seen to be empty, no surface was seen near, and what was seen of the object reaches down to that plane around it. The
-plane's rim is drawn to the mesh's open edges.
+plane's rim is drawn to the mesh's open edges. What stands on a plinth is closed on top of that.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from p2gs.export.depth_view import DepthView, pixel_matrix, pixels, seen_points
+from p2gs.export.plinth import plinth_height
 from p2gs.export.tsdf import Mesh
 from p2gs.export.unique_rows import unique_rows
 from p2gs.ops import se3
@@ -21,18 +22,19 @@ from p2gs.ops import se3
 NEAR = 4.0  # voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges
 LEAST = 0.2  # share of a side of the box that must be unseen for it to be closed
 FACED = 0.05  # share of the views that may face a side of which it is still said that nobody looked at it
+STRAY = 0.03  # share of the views up to which those that see through a place may be wrong: edges, gaps in a lid
 RIM = 0.5  # share of the unseen area's rim that must touch seen surface
 
 
 def seen_empty(points: Tensor, views: Sequence[DepthView], poses: Sequence[Tensor], clearance: float) -> Tensor:
-    """[n] whether some view sees surface further than ``clearance`` behind a point, or nothing. points [n, 3] float64, start-state
-    coordinates of the part that ``poses`` (start-state coordinates -> world, [4, 4] a view) carry."""
-    empty, columns = torch.zeros(len(points), dtype=torch.bool), points.T.contiguous()
+    """[n] whether views, more than a stray one, see surface further than ``clearance`` behind a point, or nothing. points [n, 3] float64,
+    start-state coordinates of the part that ``poses`` (start-state coordinates -> world, [4, 4] a view) carry."""
+    empty, columns = torch.zeros(len(points)), points.T.contiguous()
     for view, T in zip(views, poses, strict=True):
         z, pixel = pixels(columns, pixel_matrix(view.camera, T).to(points), view.camera)
         depth = torch.where(view.labels < 0, torch.full_like(view.depth, torch.inf), view.depth).reshape(-1)
-        empty |= torch.cat([depth, depth.new_tensor([-torch.inf])])[pixel] - z > clearance
-    return empty
+        empty += torch.cat([depth, depth.new_tensor([-torch.inf])])[pixel] - z > clearance
+    return empty > STRAY * len(views)
 
 
 def eyes_of(views: Sequence[DepthView], poses: Sequence[Tensor]) -> Tensor:
@@ -69,6 +71,7 @@ def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[T
             points[:, across] = np.stack([g.ravel() for g in grid], 1)
             if facing(torch.as_tensor(points), outward * torch.eye(3)[axis], eyes) > FACED:
                 continue
+            points[:, axis] -= outward * plinth_height(mesh, axis, outward, at, hi[axis] - lo[axis], voxel)
             within = points.copy()
             within[:, axis] -= outward * voxel
             solid = ~seen_empty(torch.as_tensor(within), views, poses, clearance).numpy()

@@ -9,6 +9,7 @@ import trimesh
 from toy import ring
 from traced import CRATE, boards, seen
 
+from p2gs.export.plinth import plinth_height
 from p2gs.export.tsdf import Mesh, fuse
 from p2gs.export.unseen import close_unseen_sides, eyes_of, facing, seen_empty
 
@@ -28,12 +29,12 @@ def look(primitives, cameras, lids=0):
     return [seen(primitives, len(primitives) - lids, c, 2 * VOXEL) for c in cameras]
 
 
-def closed(primitives, elevations=(15.0, 40.0), lids=0):
+def closed(primitives, elevations=(15.0, 40.0), lids=0, voxel=VOXEL):
     """A mesh as it was seen, and with its unseen sides closed."""
     views = look(primitives, ring(12, 160, elevations=elevations), lids)
     poses = [EYE] * len(views)
-    mesh = fuse(views, poses, 0, VOXEL, 4 * VOXEL, 2 * VOXEL)
-    return mesh, close_unseen_sides(mesh, views, poses, 0, VOXEL, 4 * VOXEL)
+    mesh = fuse(views, poses, 0, voxel, 4 * voxel, 2 * voxel)
+    return mesh, close_unseen_sides(mesh, views, poses, 0, voxel, 4 * voxel)
 
 
 def test_an_underside_that_no_camera_saw_is_closed():
@@ -83,3 +84,31 @@ def test_seen_empty_tells_what_is_before_and_behind():
     T = EYE.clone()
     T[2, 3] = 5.0 * math.sqrt(2)
     assert seen_empty(points, [view], [T], 0.1).tolist() == [False] * 4  # carried out of the picture
+
+
+# a cupboard, open to +x, on walls and a kick board that stands back
+PLINTH = 0.12
+CUPBOARD = boards(
+    ((-0.4, -0.4, PLINTH - 0.5), (0.4, 0.4, PLINTH - 0.4)),
+    ((-0.4, -0.4, 0.46), (0.4, 0.4, 0.5)),
+    *(((-0.4, y, PLINTH - 0.5), (0.4, y + 0.04, 0.5)) for y in (-0.4, 0.36)),
+    ((-0.4, -0.4, -0.5), (-0.36, 0.4, 0.5)),
+    *(((-0.4, y, -0.5), (0.28, y + 0.04, PLINTH - 0.5)) for y in (-0.4, 0.36)),
+    ((0.24, -0.4, -0.5), (0.28, 0.4, PLINTH - 0.5)),
+)
+
+
+def test_what_stands_on_a_plinth_is_closed_on_top_of_it():
+    seen, whole = (trimesh.Trimesh(m.vertices, m.faces, process=False) for m in closed(CUPBOARD, elevations=(0.0, 15.0, 40.0), voxel=0.012))
+    added = trimesh.Trimesh(whole.vertices, whole.faces[len(seen.faces) :], process=False)
+    assert added.area == pytest.approx(0.8 * 0.8, rel=0.15) and (added.face_normals[:, 2] < -0.9).mean() > 0.8
+    assert np.median(added.triangles_center[:, 2]) == pytest.approx(PLINTH - 0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("height, back, found", [(0.12, 0.12, True), (0.05, 0.12, False), (0.12, 0.03, False), (0.4, 0.12, False)])
+def test_toes_fit_under_a_front_that_stands_on_a_plinth(height, back, found):
+    block = boards(((-0.4, -0.4, height - 0.5), (0.4, 0.4, 0.5)), ((-0.4, -0.4, -0.5), (0.4 - back, 0.4, height - 0.5)))
+    mesh = fuse(look(block, ring(12, 160, elevations=(0.0, 15.0))), [EYE] * 12, 0, 0.01, 0.04, 0.02)
+    high = plinth_height(mesh, 2, -1.0, -0.5, 1.0, 0.01)
+    assert high == pytest.approx(height, abs=0.02) if found else high == 0.0
+    assert plinth_height(mesh, 2, 1.0, 0.5, 1.0, 0.01) == 0.0
