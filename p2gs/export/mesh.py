@@ -13,6 +13,7 @@ from torch import Tensor
 
 from p2gs.export.depth_view import DepthView, add_normals
 from p2gs.export.paint import draw, rasterizer_of
+from p2gs.export.pieces import join_pieces
 from p2gs.export.pose import part_transform, pose
 from p2gs.export.surface_depth import surface_depth
 from p2gs.export.trays import complete_tray
@@ -104,7 +105,8 @@ def mesh_cameras(obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: 
 
 def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> list[Mesh]:
     """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.  The base's
-    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``).
+    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``), pieces of
+    what slides joined (``join_pieces``).
 
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
     """
@@ -133,7 +135,9 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
     base = next((m for m, p in zip(meshes, obj.parts, strict=True) if p.joint is None), Mesh.empty())
     for k, part in enumerate(obj.parts):
         if part.joint is not None and part.joint.type == "prismatic" and len(meshes[k].faces) and len(base.faces):
-            meshes[k] = complete_tray(meshes[k], base, motions[k][1].numpy(), views, poses[k], voxel, TRUNCATION * voxel)
+            seen = (views, poses[k], voxel, TRUNCATION * voxel)
+            tray = complete_tray(meshes[k], base, motions[k][1].numpy(), *seen)
+            meshes[k] = join_pieces(tray, part.joint.axis.numpy(), *seen)
     return meshes
 
 

@@ -153,16 +153,26 @@ def fill_pinholes(field: np.ndarray, known: np.ndarray, enough: float = 14 / 27,
     return field, known
 
 
-def largest_components(mesh: Mesh, fraction: float = 0.1) -> Mesh:
-    """Without the connected components that have fewer than ``fraction`` of the largest one's triangles."""
+def components(mesh: Mesh) -> np.ndarray:
+    """Connected component [F] of each triangle."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    if not len(mesh.faces):
-        return mesh
     f, n = mesh.faces, len(mesh.vertices)
     graph = coo_matrix((np.ones(2 * len(f)), (np.r_[f[:, 0], f[:, 1]], np.r_[f[:, 1], f[:, 2]])), (n, n))
-    label = connected_components(graph, directed=False)[1][f[:, 0]]
+    return connected_components(graph, directed=False)[1][f[:, 0]]
+
+
+def largest_components(mesh: Mesh, fraction: float = 0.1) -> Mesh:
+    """Without the connected components that have fewer than ``fraction`` of the largest one's triangles."""
+    if not len(mesh.faces):
+        return mesh
+    label = components(mesh)
     count = np.bincount(label)
-    keep = f[count[label] >= fraction * count.max()]
-    return Mesh(mesh.vertices, keep, mesh.colours).without_unused()
+    return Mesh(mesh.vertices, mesh.faces[count[label] >= fraction * count.max()], mesh.colours).without_unused()
+
+
+def connected(mesh: Mesh) -> list[Mesh]:
+    """The mesh's connected components."""
+    label = components(mesh)
+    return [Mesh(mesh.vertices, mesh.faces[label == k], mesh.colours).without_unused() for k in np.unique(label)]

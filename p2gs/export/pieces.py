@@ -1,0 +1,98 @@
+"""What slides is one piece: pieces of a sliding part between which nobody saw it are joined along its axis.
+
+A blade in its handle, a rod in its tube: photographs show both ends of what slides, and the other parts hide the stretch between. A rigid
+part is connected, and what slides through a tight opening has the same section all along, so the section at the end of one piece goes on
+to the next. Only surfaces that no view contradicts are added. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from typing import Optional, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from p2gs.export.depth_view import DepthView
+from p2gs.export.tsdf import Mesh, connected
+from p2gs.export.unique_rows import unique_rows
+from p2gs.export.unseen import NEAR, seen_empty, sewn
+
+LEAST = 0.2  # share of the largest piece's area that a piece has
+ALIKE = 0.3  # interquartile range of a section's length along a piece, in its median, up to which the section is the same all along
+WITHIN = 3.0  # voxels from a piece's end at which its section is taken: the end itself is ragged
+APART = 1.5  # voxels from what was seen to what is added
+
+
+class Piece:
+    """A connected piece of a mesh, as it goes along an axis.  lo, hi: its ends along the axis, without what is thinner than half of its
+    section.  ragged: [2], with that.  alike: how much its section varies."""
+
+    def __init__(self, mesh: Mesh, axis: np.ndarray, voxel: float):
+        self.mesh, self.axis, self.voxel = mesh, axis, voxel
+        corners = mesh.vertices[mesh.faces]
+        self.area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        along = corners.mean(1) @ axis
+        cell = np.floor(along / voxel).astype(int)
+        low = cell.min()
+        profile = np.bincount(cell - low, self.area)
+        full = np.nonzero(profile > 0.5 * np.median(profile[profile > 0]))[0]
+        self.lo, self.hi = (low + full[0]) * voxel, (low + full[-1] + 1) * voxel
+        self.ragged = (mesh.vertices @ axis).min(), (mesh.vertices @ axis).max()
+        low, middle, high = np.quantile(profile[full[0] : full[-1] + 1], (0.25, 0.5, 0.75))
+        self.alike = float((high - low) / middle)
+
+    def section(self, at: float) -> np.ndarray:
+        """Line segments [S, 2, 3] in which the plane at ``at`` along the axis cuts it."""
+        import trimesh
+
+        return trimesh.intersections.mesh_plane(
+            trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False), self.axis, at * self.axis
+        )
+
+
+def bridge(left: Piece, right: Piece) -> Optional[Mesh]:
+    """What joins two pieces, the left one before the right one along their axis: the section of the one that has the same all along, drawn
+    out from within its end to the other one; None where neither does over the length of the gap, or there is no gap."""
+    gap = right.ragged[0] - left.ragged[1]
+    fit = [p for p in (left, right) if p.alike < ALIKE and p.hi - p.lo > gap]
+    if gap <= 0 or not fit:
+        return None
+    piece = min(fit, key=lambda p: p.alike)
+    inset = WITHIN * piece.voxel
+    start, end = (left.hi - inset, right.ragged[0]) if piece is left else (right.lo + inset, left.ragged[1])
+    lines = piece.section(start)
+    first, place = unique_rows(np.round(lines.reshape(-1, 3) / (1e-3 * piece.voxel)).astype(np.int64))  # ends that segments share
+    ring, place = lines.reshape(-1, 3)[first], place.reshape(-1, 2)
+    count = max(1, round(abs(end - start) / piece.voxel))
+    steps = np.linspace(0, end - start, count + 1)
+    points = ring[:, None] + steps[:, None] * piece.axis  # [ends, steps, 3]
+    index = np.arange(points[..., 0].size).reshape(len(ring), count + 1)
+    near, far, (p, q) = index[:, :-1], index[:, 1:], place.T
+    a, b, c, d = near[p], near[q], far[q], far[p]
+    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    return Mesh(points.reshape(-1, 3), faces, np.zeros((points[..., 0].size, 3), np.uint8))
+
+
+def join_pieces(mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float, clearance: float) -> Mesh:
+    """The mesh of a part that slides along ``axis`` [3], its pieces joined where none of the views saw that nothing is between.
+
+    views, poses, voxel, clearance: as in ``close_unseen_sides``, of the sliding part.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(mesh.faces) == 0:
+        return mesh
+    pieces = [Piece(p, axis, voxel) for p in connected(mesh)]
+    most = max(p.area.sum() for p in pieces)
+    pieces = sorted((p for p in pieces if p.area.sum() > LEAST * most), key=lambda p: p.lo)
+    seen, out = cKDTree(mesh.vertices), mesh
+    for left, right in zip(pieces, pieces[1:], strict=False):
+        added = bridge(left, right)
+        if added is None:
+            continue
+        middle = added.vertices[added.faces].mean(1)
+        keep = (seen.query(middle)[0] > APART * voxel) & ~seen_empty(torch.as_tensor(middle), views, poses, clearance).numpy()
+        added = Mesh(added.vertices, added.faces[keep], mesh.colours[seen.query(added.vertices)[1]])
+        out = sewn(out, added.without_unused(), NEAR * voxel) if keep.any() else out
+    return out
