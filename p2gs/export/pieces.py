@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from p2gs.export.depth_view import DepthView
+from p2gs.export.faces import Faces
 from p2gs.export.tsdf import Mesh, connected
 from p2gs.export.unique_rows import unique_rows
 from p2gs.export.unseen import NEAR, seen_empty, sewn
@@ -26,18 +27,17 @@ APART = 1.5  # voxels from what was seen to what is added
 
 class Piece:
     """A connected piece of a mesh, as it goes along an axis.  lo, hi: its ends along the axis, without what is thinner than half of its
-    section.  ragged: [2], with that.  alike: how much its section varies."""
+    section.  ragged: [2], with that.  area: of its surface.  alike: how much its section varies."""
 
     def __init__(self, mesh: Mesh, axis: np.ndarray, voxel: float):
         self.mesh, self.axis, self.voxel = mesh, axis, voxel
-        corners = mesh.vertices[mesh.faces]
-        self.area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-        along = corners.mean(1) @ axis
+        faces = Faces(mesh)
+        self.area, along = float(faces.area.sum()), faces.middle @ axis
         cell = np.floor(along / voxel).astype(int)
-        low = cell.min()
-        profile = np.bincount(cell - low, self.area)
+        first = cell.min()
+        profile = np.bincount(cell - first, faces.area)
         full = np.nonzero(profile > 0.5 * np.median(profile[profile > 0]))[0]
-        self.lo, self.hi = (low + full[0]) * voxel, (low + full[-1] + 1) * voxel
+        self.lo, self.hi = (first + full[0]) * voxel, (first + full[-1] + 1) * voxel
         self.ragged = (mesh.vertices @ axis).min(), (mesh.vertices @ axis).max()
         low, middle, high = np.quantile(profile[full[0] : full[-1] + 1], (0.25, 0.5, 0.75))
         self.alike = float((high - low) / middle)
@@ -46,9 +46,8 @@ class Piece:
         """Line segments [S, 2, 3] in which the plane at ``at`` along the axis cuts it."""
         import trimesh
 
-        return trimesh.intersections.mesh_plane(
-            trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False), self.axis, at * self.axis
-        )
+        mesh = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False)
+        return trimesh.intersections.mesh_plane(mesh, self.axis, at * self.axis)
 
 
 def bridge(left: Piece, right: Piece) -> Optional[Mesh]:
@@ -84,8 +83,8 @@ def join_pieces(mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses:
     if len(mesh.faces) == 0:
         return mesh
     pieces = [Piece(p, axis, voxel) for p in connected(mesh)]
-    most = max(p.area.sum() for p in pieces)
-    pieces = sorted((p for p in pieces if p.area.sum() > LEAST * most), key=lambda p: p.lo)
+    most = max(p.area for p in pieces)
+    pieces = sorted((p for p in pieces if p.area > LEAST * most), key=lambda p: p.lo)
     seen, out = cKDTree(mesh.vertices), mesh
     for left, right in zip(pieces, pieces[1:], strict=False):
         added = bridge(left, right)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from p2gs.export.faces import Faces, quantile
 from p2gs.export.tsdf import Mesh
 
 UPRIGHT = 0.3  # cosine with the vertical up to which a triangle is a wall's
@@ -24,20 +25,15 @@ def edges(mesh: Mesh, axis: int, outward: float, at: float, levels: int, voxel: 
 
     Levels are a voxel apart, from ``at`` along the axis on, against ``outward`` (1 or -1).
     """
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    cross, middle = np.cross(b - a, c - a), (a + b + c) / 3
-    area = np.linalg.norm(cross, axis=1)
-    level = np.floor((at - middle[:, axis]) * outward / voxel).astype(int)
-    wall = np.abs(cross[:, axis]) < UPRIGHT * area
-    ends = [sign * middle[:, i] for i in range(3) if i != axis for sign in (-1, 1)]
+    faces = Faces(mesh)
+    level = np.floor((at - faces.middle[:, axis]) * outward / voxel).astype(int)
+    wall = np.abs(faces.normal[:, axis]) < UPRIGHT
+    ends = [sign * faces.middle[:, i] for i in range(3) if i != axis for sign in (-1, 1)]
     out = np.full((levels, 4), np.nan)
     for i in range(levels):
         rows = np.nonzero(wall & (level == i))[0]
-        for j, end in enumerate(ends):
-            if len(rows):
-                order = rows[end[rows].argsort()]
-                total = area[order].cumsum()
-                out[i, j] = end[order[np.searchsorted(total, OUTERMOST * total[-1])]]
+        if len(rows):
+            out[i] = [quantile(end[rows], faces.area[rows], OUTERMOST) for end in ends]
     return out
 
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from p2gs.export.depth_view import DepthView
+from p2gs.export.faces import Faces, quantile
 from p2gs.export.tsdf import Mesh
 from p2gs.export.unseen import NEAR, eyes_of, facing, grid_plane, seen_empty, sewn
 
@@ -42,20 +43,9 @@ class Front:
     hi: np.ndarray
     back: float
 
-
-class Faces:
-    """Middles [F, 3], unit normals [F, 3] and areas [F] of a mesh's triangles in the frame ``axes`` [3, 3] (rows)."""
-
-    def __init__(self, mesh: Mesh, axes: np.ndarray):
-        a, b, c = (mesh.vertices[mesh.faces[:, i]] @ axes.T for i in range(3))
-        cross = np.cross(b - a, c - a)
-        length = np.linalg.norm(cross, axis=1)
-        self.middle, self.area = (a + b + c) / 3, length / 2
-        self.normal = cross / np.maximum(length, 1e-300)[:, None]
-
-    def across(self, front: Front) -> np.ndarray:
-        """Which lie within the front's rectangle, [F] bool."""
-        return ((self.middle[:, 1:] >= front.lo) & (self.middle[:, 1:] <= front.hi)).all(1)
+    def across(self, faces: Faces) -> np.ndarray:
+        """Which triangles, in its axes, lie within its rectangle, [F] bool."""
+        return ((faces.middle[:, 1:] >= self.lo) & (faces.middle[:, 1:] <= self.hi)).all(1)
 
 
 def find_front(mesh: Mesh, outward: np.ndarray, voxel: float) -> Optional[Front]:
@@ -81,15 +71,9 @@ def find_front(mesh: Mesh, outward: np.ndarray, voxel: float) -> Optional[Front]
     if (hi - lo).min() < 4 * voxel or faces.area[plate].sum() < FRONT * np.prod(hi - lo):
         return None
     front = Front(axes, lo, hi, at)
-    inner = (faces.normal[:, 0] < -FLAT) & faces.across(front) & (faces.middle[:, 0] < at) & (faces.middle[:, 0] > at - 12 * voxel)
-    back = _quantile(faces.middle[inner, 0], faces.area[inner]) if inner.any() else at - 2 * voxel
+    inner = (faces.normal[:, 0] < -FLAT) & front.across(faces) & (faces.middle[:, 0] < at) & (faces.middle[:, 0] > at - 12 * voxel)
+    back = quantile(faces.middle[inner, 0], faces.area[inner]) if inner.any() else at - 2 * voxel
     return Front(axes, lo, hi, back)
-
-
-def _quantile(values: np.ndarray, weights: np.ndarray, share: float = 0.5) -> float:
-    order = values.argsort()
-    total = weights[order].cumsum()
-    return float(values[order][np.searchsorted(total, share * total[-1])])
 
 
 @dataclass(frozen=True)
@@ -118,7 +102,7 @@ def find_side(faces: Faces, front: Front, axis: int, end: int, voxel: float) -> 
     edge, extent = (front.lo, front.hi)[end][axis], (front.hi - front.lo)[axis]
     behind = front.back - faces.middle[:, 0]
     from_edge = np.abs(faces.middle[:, 1 + axis] - edge)
-    wall = (np.abs(faces.normal[:, 1 + axis]) > FLAT) & (from_edge < BESIDE * extent) & faces.across(front) & (behind > voxel)
+    wall = (np.abs(faces.normal[:, 1 + axis]) > FLAT) & (from_edge < BESIDE * extent) & front.across(faces) & (behind > voxel)
     if not wall.any():
         return None
     # the outermost of the places where most of it is
@@ -129,14 +113,14 @@ def find_side(faces: Faces, front: Front, axis: int, end: int, voxel: float) -> 
     cells = np.floor((faces.middle[wall, 1 + other] - front.lo[other]) / voxel)
     if len(np.unique(cells)) < BEGINNING * (front.hi - front.lo)[other] / voxel:
         return None
-    at = edge + (1.0, -1.0)[end] * _quantile(from_edge[wall], faces.area[wall], OUTER)
+    at = edge + (1.0, -1.0)[end] * quantile(from_edge[wall], faces.area[wall], OUTER)
     lo, hi = _extent(faces.middle[wall, 1 + other], faces.area[wall], voxel)
     return Side(at, lo, hi, float(np.quantile(faces.middle[wall, 0], 0.02)), float(faces.area[wall].sum()))
 
 
 def has_rear(faces: Faces, front: Front, voxel: float) -> bool:
     """Whether a plate is seen behind the front, across the direction of sliding."""
-    plate = (np.abs(faces.normal[:, 0]) > 0.7) & faces.across(front) & (front.back - faces.middle[:, 0] > 6 * voxel)
+    plate = (np.abs(faces.normal[:, 0]) > 0.7) & front.across(faces) & (front.back - faces.middle[:, 0] > 6 * voxel)
     if not plate.any():
         return False
     place = np.floor((front.back - faces.middle[plate, 0]) / voxel).astype(int)
@@ -147,7 +131,7 @@ def has_rear(faces: Faces, front: Front, voxel: float) -> bool:
 def end_of_body(body: Mesh, front: Front) -> Optional[float]:
     """How far inwards the body goes on behind the front, along the front's first axis; None where there is none."""
     faces = Faces(body, front.axes)
-    behind = faces.middle[faces.across(front) & (faces.middle[:, 0] < front.back), 0]
+    behind = faces.middle[front.across(faces) & (faces.middle[:, 0] < front.back), 0]
     return float(np.quantile(behind, 0.02)) if len(behind) else None
 
 
