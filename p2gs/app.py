@@ -80,6 +80,7 @@ def parser(prog: str = "p2gs") -> Parser:
     export.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of the input (default 1)")
     export.add_argument("--up", choices=("x", "y", "z"), help="axis that points up in the file (default: the format's own)")
     export.add_argument("--extend_range", "--extend-range", action="store_true", help="joint limits until parts touch, not as observed")
+    export.add_argument("--texture", action="store_true", help="baked textures, for programs that show no vertex colours")
     export.add_argument("--origin", choices=("keep", "center", "bottom"), default="keep", help="where the origin is put (default keep)")
 
     view = add("view", "look at a run's twin in the browser")

@@ -65,7 +65,7 @@ def export(args: argparse.Namespace) -> int:
     run = finished_run(args.run)
     if not args.scale > 0:
         raise UserError(f"--scale: expected a positive number of metres per unit, got {args.scale:g}")
-    options = {"scale": args.scale, "up": args.up, "origin": args.origin, "extend_range": args.extend_range}
+    options = {"scale": args.scale, "up": args.up, "origin": args.origin, "extend_range": args.extend_range, "texture": args.texture}
     for path in export_run(run, args.format, out=args.out, **options):
         print(path)
     return 0

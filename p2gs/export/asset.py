@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Optional
+from typing import Callable, Optional
 
 import numpy as np
 
 from p2gs.export.convex import Piece, decompose, intersect
 from p2gs.export.mesh import read_meshes, write_meshes
+from p2gs.export.texture import Texture
 from p2gs.export.tsdf import Mesh, vertex_normals
 from p2gs.export.twin_json import load_twin
 from p2gs.export.unique_rows import unique_rows
@@ -74,6 +75,7 @@ class Link:
     inertia: Inertia
     joint: Optional[Hinge]
     colour: tuple[float, float, float]
+    texture: Optional[Texture] = None
 
     @property
     def origin(self) -> np.ndarray:
@@ -103,13 +105,14 @@ def load_asset(
     max_faces: int = MAX_FACES,
     solid: bool = True,
     extend_range: bool = False,
+    texture: Optional[Callable[[int, Mesh], Texture]] = None,
 ) -> Asset:
     """Read a run (its meshes are made if they are not there) into the target's conventions.
 
     scale: metres per input unit.  up: axis of the target that points up; the input's is z.  origin: ``keep`` the input's,
     ``center`` of the object's box, or the middle of its ``bottom``.  solid: with collision pieces and inertia; without, for looking
-    at only, it takes no time.  extend_range: joint limits beyond the observed motion, until parts touch.  Raises UserError for other
-    values or a run without a twin.
+    at only, it takes no time.  extend_range: joint limits beyond the observed motion, until parts touch.  texture: makes one of a part's id
+    and mesh (``texture.Baker``).  Raises UserError for other values or a run without a twin.
     """
     if up not in UPS:
         raise UserError(f"--up is '{up}', expected one of {', '.join(UPS)}")
@@ -129,7 +132,7 @@ def load_asset(
     pairs = [(p, m) for p, m in zip(obj.parts, meshes, strict=True) if len(m.faces)]
     if not pairs or pairs[0][0].joint is not None:
         raise UserError(f"{run_dir}: the static part has no surface, so there is no base to hang joints on")
-    links = [make_link(part.id, part.joint, mesh, place, density, max_faces, solid) for part, mesh in pairs]
+    links = [make_link(part.id, part.joint, mesh, place, density, max_faces, solid, texture) for part, mesh in pairs]
     return Asset(run_dir.resolve().name, links, up, overlapping_pairs(links) if solid else [])
 
 
@@ -142,8 +145,17 @@ def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placeme
     return Placement(float(scale), turns[up], where[origin])
 
 
-def make_link(part: int, joint: Optional[Joint], mesh: Mesh, place: Placement, density: float, max_faces: int, solid: bool) -> Link:
-    """One part with its collision pieces, inertia and joint."""
+def make_link(
+    part: int,
+    joint: Optional[Joint],
+    mesh: Mesh,
+    place: Placement,
+    density: float,
+    max_faces: int,
+    solid: bool,
+    texture: Optional[Callable[[int, Mesh], Texture]] = None,
+) -> Link:
+    """One part with its collision pieces, inertia, joint and texture."""
     at = np.zeros(3) if joint is None else place.points(joint.origin.numpy())
     world = simplify(mesh, max_faces)
     visual = Mesh(place.points(world.vertices) - at, world.faces, world.colours)
@@ -159,7 +171,7 @@ def make_link(part: int, joint: Optional[Joint], mesh: Mesh, place: Placement, d
         hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE)
     name = "base" if joint is None else f"part_{part}"
     colour = tuple(float(c) for c in mesh.colours.mean(0) / 255)
-    return Link(name, part, visual, pieces, inertia, hinge, colour)
+    return Link(name, part, visual, pieces, inertia, hinge, colour, texture(part, world) if texture else None)
 
 
 def inertia_of(pieces: list[Piece], density: float) -> Inertia:

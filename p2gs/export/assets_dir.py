@@ -1,13 +1,14 @@
-"""The mesh files that URDF and MJCF point to: OUT/assets/<link>.obj (visual, vertex colours) and <link>_collision_<i>.obj."""
+"""The mesh files that URDF and MJCF point to: OUT/assets/<link>.obj (visual: vertex colours, textures) and <link>_collision_<i>.obj."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TextIO
+from typing import Optional, TextIO
 
 import numpy as np
 
 from p2gs.export.asset import Asset, Link
+from p2gs.export.texture import Texture
 
 FOLDER = "assets"
 
@@ -16,10 +17,10 @@ def write_assets(asset: Asset, out: Path) -> None:
     """Geometry in link frames; files of an earlier export of the same run are replaced."""
     folder = out / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    for old in folder.glob("*.obj"):
+    for old in (f for f in folder.iterdir() if f.suffix in (".obj", ".mtl", ".png")):
         old.unlink()
     for link in asset.links:
-        write_obj(folder / visual_name(link), link.visual.vertices, link.visual.faces, link.visual.colours)
+        write_obj(folder / visual_name(link), link.visual.vertices, link.visual.faces, link.visual.colours, link.texture)
         for i, piece in enumerate(link.collision):
             write_obj(folder / collision_name(link, i), piece.vertices, piece.faces)
 
@@ -32,13 +33,29 @@ def collision_name(link: Link, index: int) -> str:
     return f"{link.name}_collision_{index}.obj"
 
 
-def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None) -> None:
-    """Wavefront OBJ; vertex colours as the three extra numbers that MeshLab, Blender and trimesh read."""
+def texture_name(link: Link) -> str:
+    return f"{link.name}.png"
+
+
+def write_obj(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, colours: Optional[np.ndarray] = None, texture: Optional[Texture] = None
+) -> None:
+    """Wavefront OBJ; vertex colours as the three extra numbers that MeshLab, Blender and trimesh read; a texture beside it."""
     rows = vertices if colours is None else np.c_[vertices, colours / 255]
     form = "v " + " ".join(["%.7g"] * 3 + (["%.4f"] * 3 if colours is not None else []))
     with open(path, "w") as file:
+        if texture is not None:
+            file.write(f"mtllib {path.stem}.mtl\n")
         _write_rows(file, rows, form)
-        _write_rows(file, faces + 1, "f %d %d %d")
+        if texture is None:
+            _write_rows(file, faces + 1, "f %d %d %d")
+            return
+        texture.save(path.with_suffix(".png"))
+        path.with_suffix(".mtl").write_text(f"newmtl {path.stem}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {path.stem}.png\n")
+        _write_rows(file, texture.uv.reshape(-1, 2), "vt %.7g %.7g")
+        file.write(f"usemtl {path.stem}\n")
+        corner = np.arange(1, faces.size + 1).reshape(-1, 3)
+        _write_rows(file, np.stack([faces + 1, corner], 2).reshape(-1, 6), "f %d/%d %d/%d %d/%d")
 
 
 def _write_rows(file: TextIO, rows: np.ndarray, form: str, chunk: int = 4096) -> None:

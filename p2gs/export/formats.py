@@ -7,6 +7,7 @@ from typing import Callable, Iterable, Optional
 
 from p2gs.export.asset import Asset, load_asset
 from p2gs.export.assets_dir import write_obj
+from p2gs.export.texture import Baker
 from p2gs.registry import Registry
 from p2gs.types import UserError
 
@@ -64,12 +65,12 @@ def ply(asset: Asset, out: Path) -> Path:
 
 @EXPORTERS.register("obj")
 def obj(asset: Asset, out: Path) -> Path:
-    """parts/<link>.obj at the start state, vertex colours."""
+    """parts/<link>.obj at the start state, vertex colours, perhaps a texture."""
     folder = out / "parts"
     folder.mkdir(parents=True, exist_ok=True)
     for link in asset.links:
         v = link.visual
-        write_obj(folder / f"{link.name}.obj", v.vertices + link.origin, v.faces, v.colours)
+        write_obj(folder / f"{link.name}.obj", v.vertices + link.origin, v.faces, v.colours, link.texture)
     return folder
 
 
@@ -81,11 +82,13 @@ def export_run(
     up: Optional[str] = None,
     origin: str = "keep",
     extend_range: bool = False,
+    texture: bool = False,
 ) -> list[Path]:
     """Write a finished run in the named formats (``all``: every one) into ``out`` (default the run's folder); returns the files.
 
     scale: metres per input unit.  up: z, y or x, by default what the format expects.  origin: keep, center or bottom.
     extend_range: joint limits go on beyond the observed motion until parts touch (twin.json keeps what was observed).
+    texture: parts get baked textures in every format but PLY, which knows none.
     Raises UserError for an unknown format, with the nearest name.
     """
     names = list(dict.fromkeys(n for f in formats for n in (EXPORTERS if f == "all" else [f])))
@@ -97,10 +100,11 @@ def export_run(
     axes = {name: up or DEFAULT_UP.get(name, "z") for name in writers}
     solid = {axes[name] for name in writers if name not in FOR_LOOKS}
     assets: dict[str, Asset] = {}
+    baker = Baker(run_dir) if texture else None
     written = []
     for name, write in writers.items():
         axis = axes[name]
         if axis not in assets:
-            assets[axis] = load_asset(run_dir, scale, axis, origin, solid=axis in solid, extend_range=extend_range)
+            assets[axis] = load_asset(run_dir, scale, axis, origin, solid=axis in solid, extend_range=extend_range, texture=baker)
         written.append(write(assets[axis], out))
     return written

@@ -18,6 +18,7 @@ from p2gs.ops.palette import part_colour
 SECONDS = 4.0  # start -> end -> start
 FLOAT, UINT, UBYTE = 5126, 5125, 5121
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
+LINEAR = 9729
 
 
 class Buffer:
@@ -28,13 +29,17 @@ class Buffer:
         self.views: list[dict] = []
         self.accessors: list[dict] = []
 
+    def add_bytes(self, content: bytes, target: int | None = None) -> int:
+        """Index of the new view."""
+        self.data += b"\0" * (-len(self.data) % 4)
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)} | ({"target": target} if target else {}))
+        self.data += content
+        return len(self.views) - 1
+
     def add(self, values: np.ndarray, kind: str, component: int, target: int | None = None, normalized: bool = False) -> int:
         """Index of the new accessor."""
-        self.data += b"\0" * (-len(self.data) % 4)
-        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes} | ({"target": target} if target else {})
-        self.data += np.ascontiguousarray(values).tobytes()
-        self.views.append(view)
-        accessor = {"bufferView": len(self.views) - 1, "componentType": component, "count": len(values), "type": kind}
+        view = self.add_bytes(np.ascontiguousarray(values).tobytes(), target)
+        accessor = {"bufferView": view, "componentType": component, "count": len(values), "type": kind}
         if component == FLOAT:
             rows = values.reshape(len(values), -1)
             accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
@@ -67,18 +72,25 @@ def glb_bytes(asset: Asset) -> bytes:
             keys, kind, path = _keyframes(link.joint, 1 - np.abs(1 - 2 * times / SECONDS))
             samplers.append({"input": clock, "output": buffer.add(keys, kind, FLOAT), "interpolation": "LINEAR"})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": i + 1, "path": path}})
-    material = {"name": "scan", "doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
+    textured = [link for link in asset.links if link.texture is not None]
+    images = [{"bufferView": buffer.add_bytes(link.texture.png()), "mimeType": "image/png", "name": link.name} for link in textured]
+    number = {link.name: i for i, link in enumerate(textured)}
+    for mesh in meshes:
+        mesh["primitives"][0]["material"] = number.get(mesh["name"], len(textured))
     document = {
         "asset": {"version": "2.0", "generator": "p2gs"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": nodes,
         "meshes": meshes,
-        "materials": [material],
+        "materials": [_material(link.name, i) for i, link in enumerate(textured)] + [_material("scan")],
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": len(buffer.data)}],
     }
+    if images:  # read between texels, but from no smaller copies, in which neighbours run together
+        document |= {"images": images, "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR}]}
+        document["textures"] = [{"source": i, "sampler": 0} for i in range(len(images))]
     if channels:
         document["animations"] = [{"name": "open_and_shut", "samplers": samplers, "channels": channels}]
     text = json.dumps(document, separators=(",", ":")).encode()
@@ -88,19 +100,33 @@ def glb_bytes(asset: Asset) -> bytes:
     return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
 
 
+def _material(name: str, texture: int | None = None) -> dict:
+    surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+    if texture is not None:
+        surface["baseColorTexture"] = {"index": texture}
+    return {"name": name, "doubleSided": True, "pbrMetallicRoughness": surface}
+
+
 def _mesh(buffer: Buffer, link: Link) -> dict:
-    v = link.visual
-    # glTF takes vertex colours as linear light, pictures are sRGB
-    srgb = v.colours / 255
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    rgba = np.c_[linear, np.ones(len(linear))]
+    v, normals = link.visual, vertex_normals(link.visual.vertices, link.visual.faces)
+    # a texture has places for triangles' corners, not for vertices that they share
+    rows = slice(None) if link.texture is None else v.faces.reshape(-1)
+    faces = v.faces if link.texture is None else np.arange(v.faces.size)
     attributes = {
-        "POSITION": buffer.add(v.vertices.astype(np.float32), "VEC3", FLOAT, ARRAY_BUFFER),
-        "NORMAL": buffer.add(vertex_normals(v.vertices, v.faces).astype(np.float32), "VEC3", FLOAT, ARRAY_BUFFER),
-        "COLOR_0": buffer.add((rgba * 255).round().astype(np.uint8), "VEC4", UBYTE, ARRAY_BUFFER, normalized=True),
+        "POSITION": buffer.add(v.vertices[rows].astype(np.float32), "VEC3", FLOAT, ARRAY_BUFFER),
+        "NORMAL": buffer.add(normals[rows].astype(np.float32), "VEC3", FLOAT, ARRAY_BUFFER),
     }
-    indices = buffer.add(v.faces.astype(np.uint32).reshape(-1), "SCALAR", UINT, ELEMENT_BUFFER)
-    return {"name": link.name, "primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}
+    if link.texture is None:
+        # glTF takes vertex colours as linear light, pictures are sRGB
+        srgb = v.colours / 255
+        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        rgba = (np.c_[linear, np.ones(len(linear))] * 255).round().astype(np.uint8)
+        attributes["COLOR_0"] = buffer.add(rgba, "VEC4", UBYTE, ARRAY_BUFFER, normalized=True)
+    else:
+        uv = link.texture.uv.reshape(-1, 2) * [1, -1] + [0, 1]  # glTF counts from the upper edge
+        attributes["TEXCOORD_0"] = buffer.add(uv.astype(np.float32), "VEC2", FLOAT, ARRAY_BUFFER)
+    indices = buffer.add(faces.astype(np.uint32).reshape(-1), "SCALAR", UINT, ELEMENT_BUFFER)
+    return {"name": link.name, "primitives": [{"attributes": attributes, "indices": indices}]}
 
 
 def _extras(link: Link) -> dict:

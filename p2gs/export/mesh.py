@@ -91,6 +91,12 @@ def trust(seen: PartView, limit: float) -> Tensor:
     return firm / (1 + (2 * seen.spread / limit) ** 2)
 
 
+def beside_others(label: Tensor) -> Tensor:
+    """Pixels [H, W] bool beside those of another label: what they saw may be a mean of both."""
+    x = label[None, None].float()
+    return (torch.nn.functional.max_pool2d(x, 3, 1, 1) != -torch.nn.functional.max_pool2d(-x, 3, 1, 1))[0, 0]
+
+
 def mesh_cameras(obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: int = VIEWS) -> list[tuple[int, Camera]]:
     """(state, camera) to look from: the training views, at most ``count`` a state evenly taken; an orbit where there are none."""
     out = []
@@ -103,16 +109,21 @@ def mesh_cameras(obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: 
     return out
 
 
-def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> list[Mesh]:
-    """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.  The base's
-    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``), pieces of
-    what slides joined (``join_pieces``).
+@dataclass
+class Sightings:
+    """What cameras see of a twin's parts. size: of its longest side.  views: labelled by place in ``obj.parts``.  motions: of each
+    part, start state -> start and end.  poses: of each part, one a view."""
 
-    obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
-    """
+    size: float
+    views: list[DepthView]
+    motions: list[list[Tensor]]
+    poses: list[list[Tensor]]
+
+
+def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> Sightings:
+    """Look at the parts. obj and cameras ((state, camera) pairs) in one coordinate system. resolution: as in ``part_meshes``."""
     lo, hi = bounds(obj, (0.0,))
     size = float((hi - lo).max())
-    voxel = size / resolution
     index = torch.zeros(max(p.id for p in obj.parts) + 1, dtype=torch.int64)
     for k, part in enumerate(obj.parts):
         index[part.id] = k
@@ -121,23 +132,34 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
     limit = fog_limit(looks, size)
     views = []
     for seen, (_, camera) in zip(looks, cameras, strict=True):
-        view = add_normals(DepthView(camera, seen.depth, seen.label, seen.colour), edge=EDGE * voxel)
-        view.cosine = view.cosine * trust(seen, limit)
+        view = add_normals(DepthView(camera, seen.depth, seen.label, seen.colour), edge=EDGE * size / resolution)
+        view.cosine = view.cosine * trust(seen, limit) * ~beside_others(seen.label)
         views.append(view)
     motions = [[start_motion(obj, k, 0.0), start_motion(obj, k, 1.0)] for k in range(len(obj.parts))]
-    poses = [[motion[state] for state, _ in cameras] for motion in motions]
+    return Sightings(size, views, motions, [[motion[state] for state, _ in cameras] for motion in motions])
+
+
+def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> list[Mesh]:
+    """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.  The base's
+    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``), pieces of
+    what slides joined (``join_pieces``).
+
+    obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
+    """
+    seen = sight(obj, cameras, resolution)
+    voxel = seen.size / resolution
     meshes = []
     for k, part in enumerate(obj.parts):
-        mesh = largest_components(fuse(views, poses[k], k, voxel, trunc=TRUNCATION * voxel, behind=BEHIND * voxel))
+        mesh = largest_components(fuse(seen.views, seen.poses[k], k, voxel, trunc=TRUNCATION * voxel, behind=BEHIND * voxel))
         if part.joint is None:
-            mesh = close_unseen_sides(mesh, views, poses[k], k, voxel, TRUNCATION * voxel)
+            mesh = close_unseen_sides(mesh, seen.views, seen.poses[k], k, voxel, TRUNCATION * voxel)
         meshes.append(mesh)
     base = next((m for m, p in zip(meshes, obj.parts, strict=True) if p.joint is None), Mesh.empty())
     for k, part in enumerate(obj.parts):
         if part.joint is not None and part.joint.type == "prismatic" and len(meshes[k].faces) and len(base.faces):
-            seen = (views, poses[k], voxel, TRUNCATION * voxel)
-            tray = complete_tray(meshes[k], base, motions[k][1].numpy(), *seen)
-            meshes[k] = join_pieces(tray, part.joint.axis.numpy(), *seen)
+            space = (seen.views, seen.poses[k], voxel)
+            tray = complete_tray(meshes[k], base, seen.motions[k][1].numpy(), *space, TRUNCATION * voxel)
+            meshes[k] = join_pieces(tray, part.joint.axis.numpy(), *space)
     return meshes
 
 

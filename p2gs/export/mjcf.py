@@ -6,7 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from p2gs.export.asset import Asset, Link, effective_inertia
-from p2gs.export.assets_dir import FOLDER, collision_name, visual_name, write_assets
+from p2gs.export.assets_dir import FOLDER, collision_name, texture_name, visual_name, write_assets
 from p2gs.export.urdf import number, numbers
 
 GRAVITY = {"z": (0, 0, -9.81), "y": (0, -9.81, 0), "x": (-9.81, 0, 0)}
@@ -16,7 +16,7 @@ def write_mjcf(asset: Asset, out: Path) -> Path:
     """OUT/twin.xml and OUT/assets. The base stands fixed in the world; joint names are those of the URDF."""
     write_assets(asset, out)
     root = ET.Element("mujoco", model=asset.name)
-    ET.SubElement(root, "compiler", angle="radian", meshdir=FOLDER, autolimits="true")
+    ET.SubElement(root, "compiler", angle="radian", meshdir=FOLDER, texturedir=FOLDER, autolimits="true")
     ET.SubElement(root, "option", timestep="0.002", integrator="implicitfast", gravity=numbers(GRAVITY[asset.up]))
     _defaults(root)
     meshes = ET.SubElement(root, "asset")
@@ -25,6 +25,9 @@ def write_mjcf(asset: Asset, out: Path) -> Path:
     for link in asset.links:
         # an open shell has no volume; its mass is not used, but the compiler would stumble over it
         ET.SubElement(meshes, "mesh", name=link.name, file=visual_name(link), inertia="shell")
+        if link.texture is not None:
+            ET.SubElement(meshes, "texture", name=link.name, type="2d", file=texture_name(link))
+            ET.SubElement(meshes, "material", name=link.name, texture=link.name)
         for i in range(len(link.collision)):
             ET.SubElement(meshes, "mesh", name=f"{link.name}_{i}", file=collision_name(link, i), inertia="convex")
     base = _body(world, asset.links[0])
@@ -63,7 +66,8 @@ def _body(parent: ET.Element, link: Link) -> ET.Element:
             body, "joint", {"class": "joint"}, name=f"joint_{link.part}", type=kind, pos="0 0 0", axis=numbers(hinge.axis)
         )
         joint.attrib |= {"range": numbers((hinge.lower, hinge.upper)), "damping": number(hinge.damping), "armature": number(0.01 * weight)}
-    ET.SubElement(body, "geom", {"class": "visual"}, mesh=link.name, rgba=numbers((*link.colour, 1.0)))
+    look = {"rgba": numbers((*link.colour, 1.0))} if link.texture is None else {"material": link.name}
+    ET.SubElement(body, "geom", {"class": "visual"} | look, mesh=link.name)
     for i in range(len(link.collision)):
         ET.SubElement(body, "geom", {"class": "collision"}, mesh=f"{link.name}_{i}")
     return body

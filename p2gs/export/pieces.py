@@ -19,10 +19,12 @@ from p2gs.export.tsdf import Mesh, connected
 from p2gs.export.unique_rows import unique_rows
 from p2gs.export.unseen import NEAR, seen_empty, sewn
 
-LEAST = 0.2  # share of the largest piece's area that a piece has
-ALIKE = 0.3  # interquartile range of a section's length along a piece, in its median, up to which the section is the same all along
+LEAST = 0.1  # share of the largest piece's area that a piece has
+ALIKE = 0.6  # interquartile range of a section's length along a piece, in its median, up to which the section is the same all along
 WITHIN = 3.0  # voxels from a piece's end at which its section is taken: the end itself is ragged
 APART = 1.5  # voxels from what was seen to what is added
+OUT = 1.5  # voxels by which what is added may stand out of what hides it
+MOST = 0.5  # share of it that views may contradict
 
 
 class Piece:
@@ -50,14 +52,12 @@ class Piece:
         return trimesh.intersections.mesh_plane(mesh, self.axis, at * self.axis)
 
 
-def bridge(left: Piece, right: Piece) -> Optional[Mesh]:
-    """What joins two pieces, the left one before the right one along their axis: the section of the one that has the same all along, drawn
-    out from within its end to the other one; None where neither does over the length of the gap, or there is no gap."""
-    gap = right.ragged[0] - left.ragged[1]
-    fit = [p for p in (left, right) if p.alike < ALIKE and p.hi - p.lo > gap]
-    if gap <= 0 or not fit:
+def bridge(left: Piece, right: Piece, drawn: Piece) -> Optional[Mesh]:
+    """What may join two pieces, the left one before the right one along their axis: the section of ``drawn``, one of them, from within its
+    end to the other one; None where that is not the same along more of it than the gap, or there is no gap."""
+    gap, piece = right.ragged[0] - left.ragged[1], drawn
+    if gap <= 0 or piece.alike > ALIKE or piece.hi - piece.lo < gap:
         return None
-    piece = min(fit, key=lambda p: p.alike)
     inset = WITHIN * piece.voxel
     start, end = (left.hi - inset, right.ragged[0]) if piece is left else (right.lo + inset, left.ragged[1])
     lines = piece.section(start)
@@ -73,10 +73,10 @@ def bridge(left: Piece, right: Piece) -> Optional[Mesh]:
     return Mesh(points.reshape(-1, 3), faces, np.zeros((points[..., 0].size, 3), np.uint8))
 
 
-def join_pieces(mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float, clearance: float) -> Mesh:
+def join_pieces(mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float) -> Mesh:
     """The mesh of a part that slides along ``axis`` [3], its pieces joined where none of the views saw that nothing is between.
 
-    views, poses, voxel, clearance: as in ``close_unseen_sides``, of the sliding part.
+    Of two ways the one that they contradict less.  views, poses, voxel: as in ``close_unseen_sides``, of the sliding part.
     """
     from scipy.spatial import cKDTree
 
@@ -87,11 +87,14 @@ def join_pieces(mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses:
     pieces = sorted((p for p in pieces if p.area > LEAST * most), key=lambda p: p.lo)
     seen, out = cKDTree(mesh.vertices), mesh
     for left, right in zip(pieces, pieces[1:], strict=False):
-        added = bridge(left, right)
-        if added is None:
-            continue
-        middle = added.vertices[added.faces].mean(1)
-        keep = (seen.query(middle)[0] > APART * voxel) & ~seen_empty(torch.as_tensor(middle), views, poses, clearance).numpy()
-        added = Mesh(added.vertices, added.faces[keep], mesh.colours[seen.query(added.vertices)[1]])
-        out = sewn(out, added.without_unused(), NEAR * voxel) if keep.any() else out
+        ways = []
+        for added in (bridge(left, right, drawn) for drawn in (left, right)):
+            if added is not None:
+                middle = added.vertices[added.faces].mean(1)
+                empty = seen_empty(torch.as_tensor(middle), views, poses, OUT * voxel).numpy()
+                ways.append((empty.mean(), added, (seen.query(middle)[0] > APART * voxel) & ~empty))
+        contradicted, added, keep = min(ways, key=lambda way: way[0], default=(1.0, None, None))
+        if contradicted < MOST and keep.any():
+            added = Mesh(added.vertices, added.faces[keep], mesh.colours[seen.query(added.vertices)[1]])
+            out = sewn(out, added.without_unused(), NEAR * voxel)
     return out

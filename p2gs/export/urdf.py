@@ -38,8 +38,9 @@ def _link(robot: ET.Element, link: Link) -> None:
     ET.SubElement(inertial, "inertia", {n: number(link.inertia.matrix[ij]) for n, ij in names.items()})
     visual = ET.SubElement(element, "visual")
     _mesh(visual, visual_name(link))
-    material = ET.SubElement(visual, "material", name=f"{link.name}_colour")
-    ET.SubElement(material, "color", rgba=numbers((*link.colour, 1.0)))
+    if link.texture is None:  # readers paint over a mesh's own texture
+        material = ET.SubElement(visual, "material", name=f"{link.name}_colour")
+        ET.SubElement(material, "color", rgba=numbers((*link.colour, 1.0)))
     for i in range(len(link.collision)):
         _mesh(ET.SubElement(element, "collision"), collision_name(link, i))
 

@@ -7,7 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from p2gs.export.asset import Asset, Hinge, Link
+from p2gs.export.assets_dir import texture_name
 from p2gs.types import UserError
+
+TEXTURES = "textures"  # folder beside the stage
 
 
 def write_usd(asset: Asset, out: Path) -> Path:
@@ -27,6 +30,9 @@ def write_usd(asset: Asset, out: Path) -> Path:
     ]
     for link in asset.links:
         lines += _link(link)
+        if link.texture is not None:
+            link.texture.save(_texture(out, link))
+            lines += _material(link)
     lines += ['    def PhysicsFixedJoint "fix_base"', "    {", "        rel physics:body1 = </twin/base>", "    }"]
     for link in asset.moving:
         lines += _joint(link, asset.links[0].name)
@@ -48,12 +54,12 @@ def _link(link: Link) -> list[str]:
         f"        quatf physics:principalAxes = {_tuple(rotation)}",
     ]
     visual = link.visual
-    body += _mesh(
-        "visual",
-        visual.vertices,
-        visual.faces,
-        [f"color3f[] primvars:displayColor = {_array(visual.colours / 255, 4)} (", '    interpolation = "vertex"', ")"],
-    )
+    look = [f"color3f[] primvars:displayColor = {_array(visual.colours / 255, 4)} (", '    interpolation = "vertex"', ")"]
+    if link.texture is not None:
+        look += [f"texCoord2f[] primvars:st = {_array(link.texture.uv.reshape(-1, 2), 7)} (", '    interpolation = "faceVarying"', ")"]
+        look += [f"rel material:binding = </twin/{link.name}_look>"]
+    schemas = "" if link.texture is None else ' (prepend apiSchemas = ["MaterialBindingAPI"])'
+    body += _mesh("visual", visual.vertices, visual.faces, look, schemas)
     for i, piece in enumerate(link.collision):
         extra = ['uniform token physics:approximation = "convexHull"', 'uniform token purpose = "guide"']
         body += _mesh(
@@ -64,6 +70,43 @@ def _link(link: Link) -> list[str]:
             ' (prepend apiSchemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"])',
         )
     return [*body, "    }"]
+
+
+def _texture(out: Path, link: Link) -> Path:
+    folder = out / TEXTURES
+    folder.mkdir(exist_ok=True)
+    return folder / texture_name(link)
+
+
+def _material(link: Link) -> list[str]:
+    here = f"/twin/{link.name}_look"
+    return [
+        f'    def Material "{link.name}_look"',
+        "    {",
+        f"        token outputs:surface.connect = <{here}/surface.outputs:surface>",
+        '        def Shader "surface"',
+        "        {",
+        '            uniform token info:id = "UsdPreviewSurface"',
+        f"            color3f inputs:diffuseColor.connect = <{here}/picture.outputs:rgb>",
+        "            float inputs:roughness = 0.9",
+        "            token outputs:surface",
+        "        }",
+        '        def Shader "picture"',
+        "        {",
+        '            uniform token info:id = "UsdUVTexture"',
+        f"            asset inputs:file = @./{TEXTURES}/{texture_name(link)}@",
+        f"            float2 inputs:st.connect = <{here}/places.outputs:result>",
+        '            token inputs:sourceColorSpace = "sRGB"',
+        "            float3 outputs:rgb",
+        "        }",
+        '        def Shader "places"',
+        "        {",
+        '            uniform token info:id = "UsdPrimvarReader_float2"',
+        '            string inputs:varname = "st"',
+        "            float2 outputs:result",
+        "        }",
+        "    }",
+    ]
 
 
 def _mesh(name: str, vertices: np.ndarray, faces: np.ndarray, extra: list[str], schemas: str = "") -> list[str]:

@@ -11,7 +11,19 @@ from toy import look_at, ring, start_parts, toy_scene, toy_twin
 
 from p2gs.export.depth_view import DepthView, add_normals, camera_rays
 from p2gs.export.frame import object_to_input
-from p2gs.export.mesh import PartView, fog_limit, look, mesh_cameras, part_meshes, read_mesh, start_motion, trust, write_mesh, write_meshes
+from p2gs.export.mesh import (
+    PartView,
+    beside_others,
+    fog_limit,
+    look,
+    mesh_cameras,
+    part_meshes,
+    read_mesh,
+    start_motion,
+    trust,
+    write_mesh,
+    write_meshes,
+)
 from p2gs.export.paint import part_coloured
 from p2gs.export.pose import pose
 from p2gs.export.run_folder import write_twin
@@ -194,7 +206,7 @@ def test_cabinet_meshes_lie_on_its_panels(run):
             mesh = read_mesh(run / "meshes" / state / f"part_{k}.ply")
             truth = pose(twin, t).means[twin.part_ids == k].numpy()
             distance = cKDTree(truth).query(mesh.vertices)[0]
-            assert np.quantile(distance, 0.95) < 0.065, (state, k)  # voxels are 0.03, Gaussians as far apart
+            assert np.quantile(distance, 0.95) < 0.07, (state, k)  # voxels are 0.03, Gaussians as far apart
             assert len(mesh.faces) > 200
     front = read_mesh(run / "meshes" / "start" / "part_2.ply").vertices
     assert abs(np.quantile(front[:, 1], 0.02) + 0.43) < 0.035  # Gaussians of a third of a voxel's depth and fuzzy rims
@@ -231,3 +243,9 @@ def test_without_cameras_an_orbit_is_used_and_nothing_to_see_is_told(tmp_path):
     write_twin(twin, tmp_path, toy_scene(n=2, size=16), media=False)
     with pytest.raises(UserError, match="nothing to mesh"):
         write_meshes(tmp_path, resolution=20)
+
+
+def test_what_is_seen_beside_another_part_is_not_trusted():
+    label = torch.tensor([[-1, -1, -1, -1, -1], [-1, 0, 0, 1, 1], [-1, 0, 0, 1, 1], [-1, 0, 0, 0, 0], [-1, 0, 0, 0, 0]])
+    inside = (~beside_others(label)).nonzero().tolist()
+    assert inside == [[4, 2], [4, 3], [4, 4]]
