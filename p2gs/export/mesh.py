@@ -16,10 +16,10 @@ from p2gs.export.paint import draw, rasterizer_of
 from p2gs.export.pieces import join_pieces
 from p2gs.export.pose import part_transform, pose
 from p2gs.export.surface_depth import surface_depth
-from p2gs.export.trays import complete_tray
+from p2gs.export.trays import clear_way, complete_tray, find_tray
 from p2gs.export.tsdf import Mesh, fuse, largest_components
 from p2gs.export.twin_json import load_twin
-from p2gs.export.unseen import close_unseen_sides
+from p2gs.export.unseen import close_unseen_sides, eyes_of
 from p2gs.export.views import NamedCamera, bounds, orbit, read_cameras
 from p2gs.ops.blend import likeliest
 from p2gs.render.base import MAX_FEATURES
@@ -141,8 +141,8 @@ def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolut
 
 def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> list[Mesh]:
     """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.  The base's
-    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``), pieces of
-    what slides joined (``join_pieces``).
+    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``) and nothing of
+    the base left in their way (``clear_way``), pieces of what slides joined (``join_pieces``).
 
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
     """
@@ -154,12 +154,18 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
         if part.joint is None:
             mesh = close_unseen_sides(mesh, seen.views, seen.poses[k], k, voxel, TRUNCATION * voxel)
         meshes.append(mesh)
-    base = next((m for m, p in zip(meshes, obj.parts, strict=True) if p.joint is None), Mesh.empty())
+    base = next((k for k, p in enumerate(obj.parts) if p.joint is None and len(meshes[k].faces)), None)
     for k, part in enumerate(obj.parts):
-        if part.joint is not None and part.joint.type == "prismatic" and len(meshes[k].faces) and len(base.faces):
-            space = (seen.views, seen.poses[k], voxel)
-            tray = complete_tray(meshes[k], base, seen.motions[k][1].numpy(), *space, TRUNCATION * voxel)
-            meshes[k] = join_pieces(tray, part.joint.axis.numpy(), *space)
+        if part.joint is None or part.joint.type != "prismatic" or not len(meshes[k].faces):
+            continue
+        space = (seen.views, seen.poses[k], voxel)
+        tray = None
+        if base is not None:
+            tray = find_tray(meshes[k], meshes[base], seen.motions[k][1].numpy(), eyes_of(*space[:2]), voxel)
+        if tray is not None:
+            meshes[k] = complete_tray(meshes[k], tray, *space, TRUNCATION * voxel)
+            meshes[base] = clear_way(meshes[base], tray, voxel)
+        meshes[k] = join_pieces(meshes[k], part.joint.axis.numpy(), *space)
     return meshes
 
 

@@ -2,7 +2,7 @@
 
 A drawer is seen as far as it comes out of the body: its front, the beginnings of its sides, often not its bottom. What slides out of an
 opening behind a front, with two sides and open between them, is taken for a tray that ends a little before the body does. Its sides,
-bottom and rear are added where nothing of the part was seen. Not in the paper.
+bottom and rear are added where nothing of the part was seen, and what would stand in its way is taken out of the body. Not in the paper.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 from p2gs.export.depth_view import DepthView
 from p2gs.export.faces import Faces, quantile
 from p2gs.export.tsdf import Mesh
-from p2gs.export.unseen import NEAR, eyes_of, facing, grid_plane, seen_empty, sewn
+from p2gs.export.unseen import NEAR, facing, grid_plane, seen_empty, sewn
 
 FLAT = 0.8  # cosine with a direction from which a triangle faces it
 FRONT = 0.5  # share of its rectangle that a front fills
@@ -30,6 +30,7 @@ BOTTOM = 0.2  # and that a bottom fills where it is seen; below, that is where t
 NOTHING = 0.9  # share of a side that is seen to be empty from which on it is not there
 LEAST = 8.0  # voxels that the body must go on behind the front
 APART = 2.5  # voxels from what was seen to what is added
+CLEAR = 1.5  # voxels within its sides from which on a tray needs its way
 DEPTH = 0.8  # of the way from the front to the end of the body behind it
 
 
@@ -154,19 +155,33 @@ def mouth_of(front: Front, sides: Sequence[Sequence[Optional[Side]]], eyes: Tens
 
 @dataclass(frozen=True)
 class Tray:
-    """An open box behind a front. lo, hi [3]: its corners in the front's axes; mouth: (axis, end) of its open side, across the first."""
+    """An open box behind a front. lo, hi [3]: its corners in the front's axes; mouth: (axis, end) of its open side, across the first.
+
+    travel: how far it slides out.  shut [4, 4]: brings what it slides into from its place in the start state to where, as seen from the
+    drawer in its own, it is when the drawer is shut.
+    """
 
     front: Front
     lo: np.ndarray
     hi: np.ndarray
     mouth: tuple[int, int]
+    travel: float
+    shut: np.ndarray
 
 
-def find_tray(mesh: Mesh, body: Mesh, outward: np.ndarray, travel: float, eyes: Tensor, voxel: float) -> Optional[Tray]:
+def find_tray(mesh: Mesh, body: Mesh, slide: np.ndarray, eyes: Tensor, voxel: float) -> Optional[Tray]:
     """The tray of which ``mesh`` is what was seen; None where it is none, or was seen to its rear.
 
-    body: what it slides into, as it stands to it when shut.  outward [3]: the way it slides out, by ``travel``.  eyes [V, 3]: the cameras.
+    body: what it slides into.  slide [4, 4]: its motion from the start state, in which both meshes stand, to the end.  eyes [V, 3]: the
+    cameras, in the sliding part's coordinates.
     """
+    travel, shut = float(np.linalg.norm(slide[:3, 3])), np.eye(4)
+    if travel < voxel:
+        return None
+    outward = slide[:3, 3] / travel
+    if (_centre(mesh) - _centre(body)) @ outward < 0:  # it slides in, and is shut at the end
+        outward, shut = -outward, np.linalg.inv(slide)
+        body = body.transformed(shut)
     front = find_front(mesh, outward, voxel)
     end = None if front is None else end_of_body(body, front)
     if end is None or front.back - end < LEAST * voxel:
@@ -189,29 +204,17 @@ def find_tray(mesh: Mesh, body: Mesh, outward: np.ndarray, travel: float, eyes: 
         return None
     if bottom is not None and bottom.area > BOTTOM * out:
         (lo, hi)[1 - mouth[1]][1 + across] = bottom.at
-    return Tray(front, lo, hi, mouth)
+    return Tray(front, lo, hi, mouth, travel, shut)
 
 
-def complete_tray(
-    mesh: Mesh, body: Mesh, slide: np.ndarray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float, clearance: float
-) -> Mesh:
-    """The mesh of what was seen of a sliding part, with the sides, bottom and rear of its tray where nothing was seen (``find_tray``), and
-    without what is not the tray's.
+def complete_tray(mesh: Mesh, tray: Tray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float, clearance: float) -> Mesh:
+    """The mesh of what was seen of a sliding part, with the sides, bottom and rear of its tray where nothing was seen, and without what is
+    not the tray's.
 
-    body: what it slides into.  slide [4, 4]: its motion from the start state, in which both meshes stand, to the end.  views, poses, voxel,
-    clearance: as in ``close_unseen_sides``, of the sliding part.
+    views, poses, voxel, clearance: as in ``close_unseen_sides``, of the sliding part.
     """
     from scipy.spatial import cKDTree
 
-    travel = float(np.linalg.norm(slide[:3, 3]))
-    if travel < voxel:
-        return mesh
-    outward = slide[:3, 3] / travel
-    if (_centre(mesh) - _centre(body)) @ outward < 0:  # it slides in, and is shut at the end
-        outward, body = -outward, body.transformed(np.linalg.inv(slide))
-    tray = find_tray(mesh, body, outward, travel, eyes_of(views, poses), voxel)
-    if tray is None:
-        return mesh
     mesh = _without_strays(mesh, tray, NEAR * voxel)
     seen, colours = cKDTree(mesh.vertices), mesh.colours
     for axis, e in ((1, 0), (1, 1), (2, 0), (2, 1), (0, 0)):
@@ -228,6 +231,16 @@ def complete_tray(
         if len(plate.faces):
             mesh = sewn(mesh, plate, NEAR * voxel)
     return mesh
+
+
+def clear_way(body: Mesh, tray: Tray, voxel: float) -> Mesh:
+    """What a tray slides into (in the start state) without what stands in its way: dim insides of drawers are drawn as lids, which may be
+    taken for the body's."""
+    middle = Faces(body.transformed(tray.shut), tray.front.axes).middle
+    lo, hi = tray.lo + CLEAR * voxel, tray.hi - CLEAR * voxel
+    hi[0] += tray.travel
+    within = ((middle > lo) & (middle < hi)).all(1)
+    return Mesh(body.vertices, body.faces[~within], body.colours).without_unused() if within.any() else body
 
 
 def _without_strays(mesh: Mesh, tray: Tray, reach: float) -> Mesh:

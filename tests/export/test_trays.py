@@ -9,8 +9,9 @@ from toy import ring
 from traced import CRATE as BODY
 from traced import boards, seen
 
-from p2gs.export.trays import DEPTH, complete_tray, find_front
+from p2gs.export.trays import DEPTH, clear_way, complete_tray, find_front, find_tray
 from p2gs.export.tsdf import Mesh, fuse
+from p2gs.export.unseen import eyes_of
 
 VOXEL = 0.02
 TRAVEL = 0.35
@@ -48,7 +49,8 @@ def completed(part, body=BODY, shifts=(0.0, TRAVEL)):
     mesh, carcass = (fuse(views, p, k, VOXEL, 4 * VOXEL, 2 * VOXEL) for k, p in ((1, poses), (0, still)))
     slide = np.eye(4)
     slide[0, 3] = shifts[1] - shifts[0]
-    return mesh, complete_tray(mesh, carcass, slide, views, poses, VOXEL, 4 * VOXEL)
+    tray = find_tray(mesh, carcass, slide, eyes_of(views, poses), VOXEL)
+    return mesh, mesh if tray is None else complete_tray(mesh, tray, views, poses, VOXEL, 4 * VOXEL)
 
 
 @pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
@@ -99,3 +101,24 @@ def test_without_a_body_behind_it_nothing_is_known():
     seen, whole = completed(TRAY, body=boards(((-0.5, -0.4, -0.4), (0.5, 0.4, -0.36))))
     assert whole is seen
     assert find_front(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((3, 3), np.uint8)), np.array([1.0, 0, 0]), VOXEL) is None
+
+
+@pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
+def test_nothing_of_the_body_stands_in_the_trays_way(shifts):
+    """A sheet across the drawer's way goes out of the body, in the drawer and before it; walls, and what is beside its way, stay."""
+    views, poses = views_of(BODY, TRAY, shifts)
+    still = [torch.eye(4, dtype=torch.float64)] * len(views)
+    part, body = (fuse(views, p, k, VOXEL, 4 * VOXEL, 2 * VOXEL) for k, p in ((1, poses), (0, still)))
+    slide = np.eye(4)
+    slide[0, 3] = shifts[1] - shifts[0]
+    tray = find_tray(part, body, slide, eyes_of(views, poses), VOXEL)
+
+    def sheet(x, y, z):
+        t = trimesh.creation.box((0.001, 0.1, 0.04))
+        return Mesh(t.vertices + [x, y, z], t.faces, np.zeros((8, 3), np.uint8))
+
+    assert clear_way(body, tray, VOXEL) is body
+    away, stays = [(0.2, 0, -0.05), (0.7, 0, -0.05)], [(1.1, 0, -0.05), (0.2, 0, 0.25), (-0.45, 0, 0)]
+    for at in away + stays:
+        cleared = clear_way(Mesh.join([body, sheet(*at)]), tray, VOXEL)
+        assert len(cleared.faces) == len(body.faces) + (0 if at in away else 12), at
