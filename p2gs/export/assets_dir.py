@@ -17,8 +17,9 @@ def write_assets(asset: Asset, out: Path) -> None:
     """Geometry in link frames; files of an earlier export of the same run are replaced."""
     folder = out / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    for old in (f for f in folder.iterdir() if f.suffix in (".obj", ".mtl", ".png")):
-        old.unlink()
+    for old in folder.glob("*.obj"):
+        for suffix in (".obj", ".mtl", ".png"):
+            old.with_suffix(suffix).unlink(missing_ok=True)
     for link in asset.links:
         write_obj(folder / visual_name(link), link.visual.vertices, link.visual.faces, link.visual.colours, link.texture)
         for i, piece in enumerate(link.collision):

@@ -42,15 +42,20 @@ def views_of(body, part, shifts, size=160):
     return views, poses
 
 
-def completed(part, body=BODY, shifts=(0.0, TRAVEL)):
-    """The part's mesh as seen and as completed, both in the start state."""
+def found(part, body=BODY, shifts=(0.0, TRAVEL)):
+    """The part's mesh and the body's as seen, in the start state, the tray, and the views with the part's poses."""
     views, poses = views_of(body, part, shifts)
     still = [torch.eye(4, dtype=torch.float64)] * len(views)
     mesh, carcass = (fuse(views, p, k, VOXEL, 4 * VOXEL, 2 * VOXEL) for k, p in ((1, poses), (0, still)))
     slide = np.eye(4)
     slide[0, 3] = shifts[1] - shifts[0]
-    tray = find_tray(mesh, carcass, slide, eyes_of(views, poses), VOXEL)
-    return mesh, mesh if tray is None else complete_tray(mesh, tray, views, poses, VOXEL, 4 * VOXEL)
+    return mesh, carcass, find_tray(mesh, carcass, slide, eyes_of(views, poses), VOXEL), (views, poses)
+
+
+def completed(part, body=BODY, shifts=(0.0, TRAVEL)):
+    """The part's mesh as seen and as completed, both in the start state."""
+    mesh, _, tray, looks = found(part, body, shifts)
+    return mesh, mesh if tray is None else complete_tray(mesh, tray, *looks, VOXEL, 4 * VOXEL)
 
 
 @pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
@@ -106,12 +111,7 @@ def test_without_a_body_behind_it_nothing_is_known():
 @pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
 def test_nothing_of_the_body_stands_in_the_trays_way(shifts):
     """A sheet across the drawer's way goes out of the body, in the drawer and before it; walls, and what is beside its way, stay."""
-    views, poses = views_of(BODY, TRAY, shifts)
-    still = [torch.eye(4, dtype=torch.float64)] * len(views)
-    part, body = (fuse(views, p, k, VOXEL, 4 * VOXEL, 2 * VOXEL) for k, p in ((1, poses), (0, still)))
-    slide = np.eye(4)
-    slide[0, 3] = shifts[1] - shifts[0]
-    tray = find_tray(part, body, slide, eyes_of(views, poses), VOXEL)
+    _, body, tray, _ = found(TRAY, shifts=shifts)
 
     def sheet(x, y, z):
         t = trimesh.creation.box((0.001, 0.1, 0.04))
