@@ -16,7 +16,7 @@ from p2gs.export.paint import draw, rasterizer_of
 from p2gs.export.pieces import join_pieces
 from p2gs.export.pose import part_transform, pose
 from p2gs.export.surface_depth import surface_depth
-from p2gs.export.trays import clear_way, complete_tray, find_tray
+from p2gs.export.trays import clear_way, complete_tray, find_tray, not_the_trays
 from p2gs.export.tsdf import Mesh, fuse, largest_components
 from p2gs.export.twin_json import load_twin
 from p2gs.export.unseen import close_unseen_sides, eyes_of
@@ -165,6 +165,10 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
         if tray is not None:
             meshes[k] = complete_tray(meshes[k], tray, *space, TRUNCATION * voxel)
             meshes[base] = clear_way(meshes[base], tray, voxel)
+            drawn = int(np.allclose(tray.shut, np.eye(4)))  # the state in which it is open
+            for j in (j for j, p in enumerate(obj.parts) if p.joint is not None and j != k and len(meshes[j].faces)):
+                place = torch.linalg.inv(seen.motions[k][drawn]) @ seen.motions[j][drawn]
+                meshes[j] = not_the_trays(meshes[j], tray, place.numpy(), voxel)
         meshes[k] = join_pieces(meshes[k], part.joint.axis.numpy(), *space)
     return meshes
 

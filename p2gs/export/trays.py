@@ -30,6 +30,7 @@ BOTTOM = 0.2  # and that a bottom fills where it is seen; below, that is where t
 NOTHING = 0.9  # share of a side that is seen to be empty from which on it is not there
 LEAST = 8.0  # voxels that the body must go on behind the front
 APART = 2.5  # voxels from what was seen to what is added
+ON = 2.0  # voxels from a tray within which a surface is its own
 CLEAR = 1.5  # voxels within its sides from which on a tray needs its way
 DEPTH = 0.8  # of the way from the front to the end of the body behind it
 
@@ -241,6 +242,17 @@ def clear_way(body: Mesh, tray: Tray, voxel: float) -> Mesh:
     hi[0] += tray.travel
     within = ((middle > lo) & (middle < hi)).all(1)
     return Mesh(body.vertices, body.faces[~within], body.colours).without_unused() if within.any() else body
+
+
+def not_the_trays(other: Mesh, tray: Tray, place: np.ndarray, voxel: float) -> Mesh:
+    """Another moving part's mesh (in its start state) without what lies in or on the tray while that is open: sides of the tray that were
+    labelled as the other's.
+
+    place [4, 4]: from the other part's start state to where, as seen from the drawer in its own, it is while the drawer is open.
+    """
+    middle = Faces(other.transformed(place), tray.front.axes).middle
+    within = ((middle > tray.lo - ON * voxel) & (middle < tray.hi + ON * voxel)).all(1)
+    return Mesh(other.vertices, other.faces[~within], other.colours).without_unused() if within.any() else other
 
 
 def _without_strays(mesh: Mesh, tray: Tray, reach: float) -> Mesh:

@@ -9,7 +9,7 @@ from toy import ring
 from traced import CRATE as BODY
 from traced import boards, seen
 
-from p2gs.export.trays import DEPTH, clear_way, complete_tray, find_front, find_tray
+from p2gs.export.trays import DEPTH, clear_way, complete_tray, find_front, find_tray, not_the_trays
 from p2gs.export.tsdf import Mesh, fuse
 from p2gs.export.unseen import eyes_of
 
@@ -122,3 +122,20 @@ def test_nothing_of_the_body_stands_in_the_trays_way(shifts):
     for at in away + stays:
         cleared = clear_way(Mesh.join([body, sheet(*at)]), tray, VOXEL)
         assert len(cleared.faces) == len(body.faces) + (0 if at in away else 12), at
+
+
+def sheet(x, y, z):
+    t = trimesh.creation.box((0.1, 0.001, 0.04))
+    return Mesh(t.vertices + [x, y, z], t.faces, np.zeros((8, 3), np.uint8))
+
+
+@pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
+def test_a_patch_of_another_part_on_the_trays_side_goes(shifts):
+    """Where it is while the drawer is open tells: on its side, not before its front, beside it or over its mouth."""
+    _, _, tray, _ = found(TRAY, shifts=shifts)
+    place = np.eye(4)  # from the other part's start state, which moves to where it is while the drawer is open, to the drawer's own
+    place[:3, 3] = [-0.2, 0, 0.3]
+    for at in ((0.3, -0.32, -0.05), (0.3, 0.31, 0.0), (0.3, -0.45, -0.05), (0.3, 0.0, 0.3), (0.75, 0.0, 0.0)):
+        other = sheet(*(np.array([at[0] + shifts[0], *at[1:]]) - place[:3, 3]))
+        kept = not_the_trays(other, tray, place, VOXEL)
+        assert len(kept.faces) == (0 if abs(at[1]) in (0.32, 0.31) else 12), at
