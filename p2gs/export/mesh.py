@@ -141,8 +141,9 @@ def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolut
 
 def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> list[Mesh]:
     """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.  The base's
-    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``) and nothing of
-    the base left in their way (``clear_way``), pieces of what slides joined (``join_pieces``).
+    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``), with nothing of
+    the base left in their way (``clear_way``) or of other parts on them (``not_the_trays``), and pieces of what slides joined
+    (``join_pieces``).
 
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
     """
@@ -165,9 +166,8 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
         if tray is not None:
             meshes[k] = complete_tray(meshes[k], tray, *space, TRUNCATION * voxel)
             meshes[base] = clear_way(meshes[base], tray, voxel)
-            drawn = int(np.allclose(tray.shut, np.eye(4)))  # the state in which it is open
             for j in (j for j, p in enumerate(obj.parts) if p.joint is not None and j != k and len(meshes[j].faces)):
-                place = torch.linalg.inv(seen.motions[k][drawn]) @ seen.motions[j][drawn]
+                place = torch.linalg.inv(seen.motions[k][tray.drawn]) @ seen.motions[j][tray.drawn]
                 meshes[j] = not_the_trays(meshes[j], tray, place.numpy(), voxel)
         meshes[k] = join_pieces(meshes[k], part.joint.axis.numpy(), *space)
     return meshes

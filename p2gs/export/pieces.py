@@ -85,6 +85,8 @@ def join_pieces(mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses:
     pieces = [Piece(p, axis, voxel) for p in connected(mesh)]
     most = max(p.area for p in pieces)
     pieces = sorted((p for p in pieces if p.area > LEAST * most), key=lambda p: p.lo)
+    if len(pieces) < 2:
+        return mesh
     seen, out = cKDTree(mesh.vertices), mesh
     for left, right in zip(pieces, pieces[1:], strict=False):
         ways = []

@@ -41,20 +41,26 @@ class Texture:
         return cv2.imencode(".png", np.ascontiguousarray(self.image[..., ::-1]))[1].tobytes()
 
 
+def tiles(count: int) -> tuple[int, np.ndarray]:
+    """Side of the picture [texels] of ``count`` triangles, and column and row of the first texel of each one's tile, [count, 2]."""
+    across = max(1, math.ceil(math.sqrt((count + 1) // 2)))
+    tile = np.arange(count) // 2
+    return across * TILE, TILE * np.stack([tile % across, tile // across], 1)
+
+
 def layout(count: int) -> tuple[int, np.ndarray]:
-    """Side of the picture [texels] and where the corners of ``count`` triangles lie in it, [count, 3, 2] texels from the upper left corner.
+    """Side of the picture [texels] and uv of the corners of ``count`` triangles in it, [count, 3, 2] (``Texture``).
 
     Corners lie on the centres of texels, and between the two triangles of a tile is room for both, so that no colour of a neighbour shows
     where a picture is read between texels.
     """
-    tiles = (count + 1) // 2
-    across = max(1, math.ceil(math.sqrt(tiles)))
+    side, first = tiles(count)
     lower = np.array([[0, 0], [TILE - 3, 0], [0, TILE - 3]])
     upper = np.array([[TILE - 1, TILE - 1], [2, TILE - 1], [TILE - 1, 2]])
-    tile = np.arange(count) // 2
-    corner = TILE * np.stack([tile % across, tile // across], 1)
     at = np.where((np.arange(count) % 2 == 0)[:, None, None], lower, upper)
-    return across * TILE, corner[:, None] + at + 0.5
+    uv = (first[:, None] + at + 0.5) / side
+    uv[..., 1] = 1 - uv[..., 1]
+    return side, uv
 
 
 def texels(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,23 +69,22 @@ def texels(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     short = TILE - 3
     own = [i + j <= TILE - 2, i + j >= TILE - 1]
     along = [np.stack([i, j], 1) / short, np.stack([TILE - 1 - i, TILE - 1 - j], 1) / short]
-    _, corners = layout(count)
+    _, first = tiles(count)
     triangle, weights, place = [], [], []
     for half in (0, 1):
         which = np.arange(half, count, 2)
         uv = along[half][own[half]]
         uv = uv / np.maximum(uv.sum(1, keepdims=True), 1)  # beyond the long edge: its nearest place
-        origin = (corners[which, 0] - 0.5).astype(np.int64) - (0 if half == 0 else TILE - 1)
         here = np.stack([i, j], 1)[own[half]]
         triangle.append(np.repeat(which, len(uv)))
         weights.append(np.tile(np.c_[1 - uv.sum(1), uv], (len(which), 1)))
-        place.append((origin[:, None] + here).reshape(-1, 2))
+        place.append((first[which, None] + here).reshape(-1, 2))
     return np.concatenate(triangle), np.concatenate(weights), np.concatenate(place)
 
 
 def bake(mesh: Mesh, seen: Sightings, part: int, resolution: int = RESOLUTION) -> Texture:
     """The texture of a part's mesh in the start state, from the views of both. part: place in the twin's parts."""
-    side, corners = layout(len(mesh.faces))
+    side, uv = layout(len(mesh.faces))
     triangle, weights, place = texels(len(mesh.faces))
     points = (mesh.vertices[mesh.faces[triangle]] * weights[..., None]).sum(1)
     colour = (mesh.colours[mesh.faces[triangle]] * weights[..., None]).sum(1) / 255
@@ -90,8 +95,6 @@ def bake(mesh: Mesh, seen: Sightings, part: int, resolution: int = RESOLUTION) -
     colour[told] = tint.numpy()[told]
     image = np.zeros((side, side, 3), np.uint8)
     image[place[:, 1], place[:, 0]] = (colour.clip(0, 1) * 255).round()
-    uv = corners / side
-    uv[..., 1] = 1 - uv[..., 1]
     return Texture(uv, image)
 
 

@@ -158,8 +158,8 @@ def mouth_of(front: Front, sides: Sequence[Sequence[Optional[Side]]], eyes: Tens
 class Tray:
     """An open box behind a front. lo, hi [3]: its corners in the front's axes; mouth: (axis, end) of its open side, across the first.
 
-    travel: how far it slides out.  shut [4, 4]: brings what it slides into from its place in the start state to where, as seen from the
-    drawer in its own, it is when the drawer is shut.
+    travel: how far it slides out.  drawn: the state in which it is out, 0 or 1.  shut [4, 4]: brings what it slides into from its place in
+    the start state to where, as seen from the drawer in its own, it is when the drawer is shut.
     """
 
     front: Front
@@ -167,6 +167,7 @@ class Tray:
     hi: np.ndarray
     mouth: tuple[int, int]
     travel: float
+    drawn: int
     shut: np.ndarray
 
 
@@ -176,12 +177,12 @@ def find_tray(mesh: Mesh, body: Mesh, slide: np.ndarray, eyes: Tensor, voxel: fl
     body: what it slides into.  slide [4, 4]: its motion from the start state, in which both meshes stand, to the end.  eyes [V, 3]: the
     cameras, in the sliding part's coordinates.
     """
-    travel, shut = float(np.linalg.norm(slide[:3, 3])), np.eye(4)
+    travel, drawn, shut = float(np.linalg.norm(slide[:3, 3])), 1, np.eye(4)
     if travel < voxel:
         return None
     outward = slide[:3, 3] / travel
     if (_centre(mesh) - _centre(body)) @ outward < 0:  # it slides in, and is shut at the end
-        outward, shut = -outward, np.linalg.inv(slide)
+        outward, drawn, shut = -outward, 0, np.linalg.inv(slide)
         body = body.transformed(shut)
     front = find_front(mesh, outward, voxel)
     end = None if front is None else end_of_body(body, front)
@@ -205,7 +206,7 @@ def find_tray(mesh: Mesh, body: Mesh, slide: np.ndarray, eyes: Tensor, voxel: fl
         return None
     if bottom is not None and bottom.area > BOTTOM * out:
         (lo, hi)[1 - mouth[1]][1 + across] = bottom.at
-    return Tray(front, lo, hi, mouth, travel, shut)
+    return Tray(front, lo, hi, mouth, travel, drawn, shut)
 
 
 def complete_tray(mesh: Mesh, tray: Tray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float, clearance: float) -> Mesh:
@@ -240,8 +241,7 @@ def clear_way(body: Mesh, tray: Tray, voxel: float) -> Mesh:
     middle = Faces(body.transformed(tray.shut), tray.front.axes).middle
     lo, hi = tray.lo + CLEAR * voxel, tray.hi - CLEAR * voxel
     hi[0] += tray.travel
-    within = ((middle > lo) & (middle < hi)).all(1)
-    return Mesh(body.vertices, body.faces[~within], body.colours).without_unused() if within.any() else body
+    return _without(body, ((middle > lo) & (middle < hi)).all(1))
 
 
 def not_the_trays(other: Mesh, tray: Tray, place: np.ndarray, voxel: float) -> Mesh:
@@ -251,8 +251,7 @@ def not_the_trays(other: Mesh, tray: Tray, place: np.ndarray, voxel: float) -> M
     place [4, 4]: from the other part's start state to where, as seen from the drawer in its own, it is while the drawer is open.
     """
     middle = Faces(other.transformed(place), tray.front.axes).middle
-    within = ((middle > tray.lo - ON * voxel) & (middle < tray.hi + ON * voxel)).all(1)
-    return Mesh(other.vertices, other.faces[~within], other.colours).without_unused() if within.any() else other
+    return _without(other, ((middle > tray.lo - ON * voxel) & (middle < tray.hi + ON * voxel)).all(1))
 
 
 def _without_strays(mesh: Mesh, tray: Tray, reach: float) -> Mesh:
@@ -260,8 +259,12 @@ def _without_strays(mesh: Mesh, tray: Tray, reach: float) -> Mesh:
     middle = Faces(mesh, tray.front.axes).middle
     outside = np.stack([tray.lo[1:] - middle[:, 1:], middle[:, 1:] - tray.hi[1:]], 2) > reach
     outside[:, tray.mouth[0], tray.mouth[1]] = False
-    stray = (middle[:, 0] < tray.front.back - reach) & outside.any((1, 2))
-    return Mesh(mesh.vertices, mesh.faces[~stray], mesh.colours).without_unused() if stray.any() else mesh
+    return _without(mesh, (middle[:, 0] < tray.front.back - reach) & outside.any((1, 2)))
+
+
+def _without(mesh: Mesh, gone: np.ndarray) -> Mesh:
+    """The mesh without the triangles ``gone`` [F] bool; itself where there are none."""
+    return Mesh(mesh.vertices, mesh.faces[~gone], mesh.colours).without_unused() if gone.any() else mesh
 
 
 def _centre(mesh: Mesh) -> np.ndarray:

@@ -16,6 +16,7 @@ from p2gs.ops import se3
 SURFACE = 0.015  # tolerance of rendered depth (internal units): nearer than this to a surface is on it
 SEEN = 0.05  # share of the views that may see what counts as hidden
 
+
 @torch.no_grad()
 def explain_by_free_space(
     means: Tensor, labels: Tensor, transforms: Tensor, times: Tensor, stacks: list[DepthStack], tau: float

@@ -36,14 +36,12 @@ def within(count: int, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("count", [1, 2, 3, 50, 1001])
 def test_no_triangle_shows_its_neighbours_colours(count):
     """Every triangle painted in one colour of its own, read anywhere in it, is of that colour."""
-    side, corners = layout(count)
+    side, uv = layout(count)
     triangle, weights, place = texels(count)
     assert place.min() >= 0 and place.max() < side and len(np.unique(place, axis=0)) == len(place)  # no texel twice
     colours = np.random.default_rng(1).integers(0, 256, (count, 3)).astype(np.uint8)
     image = np.zeros((side, side, 3), np.uint8)
     image[place[:, 1], place[:, 0]] = colours[triangle]
-    uv = corners / side
-    uv[..., 1] = 1 - uv[..., 1]
     which, w = within(count, 4000)
     assert np.allclose(read(Texture(uv, image), (uv[which] * w[..., None]).sum(1)), colours[which] / 255, atol=1e-6)
     assert np.allclose(weights.sum(1), 1) and weights.min() >= -1e-9
@@ -52,12 +50,10 @@ def test_no_triangle_shows_its_neighbours_colours(count):
 @pytest.mark.parametrize("count", [2, 37])
 def test_texels_lie_where_their_triangle_says(count):
     """A picture of the barycentric coordinates themselves, read anywhere, gives them back."""
-    side, corners = layout(count)
+    side, uv = layout(count)
     triangle, weights, place = texels(count)
     image = np.zeros((side, side, 3))
     image[place[:, 1], place[:, 0]] = weights * 255
-    uv = corners / side
-    uv[..., 1] = 1 - uv[..., 1]
     which, w = within(count, 2000)
     off = np.abs(read(Texture(uv, image), (uv[which] * w[..., None]).sum(1)) - w)
     assert np.median(off) < 1e-6 and off.max() < 0.5 / (TILE - 3)  # along the long edge: the nearest place in the triangle

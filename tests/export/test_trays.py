@@ -108,25 +108,21 @@ def test_without_a_body_behind_it_nothing_is_known():
     assert find_front(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((3, 3), np.uint8)), np.array([1.0, 0, 0]), VOXEL) is None
 
 
+def sheet(at, size):
+    t = trimesh.creation.box(size)
+    return Mesh(t.vertices + at, t.faces, np.zeros((8, 3), np.uint8))
+
+
 @pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
 def test_nothing_of_the_body_stands_in_the_trays_way(shifts):
     """A sheet across the drawer's way goes out of the body, in the drawer and before it; walls, and what is beside its way, stay."""
     _, body, tray, _ = found(TRAY, shifts=shifts)
 
-    def sheet(x, y, z):
-        t = trimesh.creation.box((0.001, 0.1, 0.04))
-        return Mesh(t.vertices + [x, y, z], t.faces, np.zeros((8, 3), np.uint8))
-
     assert clear_way(body, tray, VOXEL) is body
     away, stays = [(0.2, 0, -0.05), (0.7, 0, -0.05)], [(1.1, 0, -0.05), (0.2, 0, 0.25), (-0.45, 0, 0)]
     for at in away + stays:
-        cleared = clear_way(Mesh.join([body, sheet(*at)]), tray, VOXEL)
+        cleared = clear_way(Mesh.join([body, sheet(at, (0.001, 0.1, 0.04))]), tray, VOXEL)
         assert len(cleared.faces) == len(body.faces) + (0 if at in away else 12), at
-
-
-def sheet(x, y, z):
-    t = trimesh.creation.box((0.1, 0.001, 0.04))
-    return Mesh(t.vertices + [x, y, z], t.faces, np.zeros((8, 3), np.uint8))
 
 
 @pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
@@ -136,6 +132,6 @@ def test_a_patch_of_another_part_on_the_trays_side_goes(shifts):
     place = np.eye(4)  # from the other part's start state, which moves to where it is while the drawer is open, to the drawer's own
     place[:3, 3] = [-0.2, 0, 0.3]
     for at in ((0.3, -0.32, -0.05), (0.3, 0.31, 0.0), (0.3, -0.45, -0.05), (0.3, 0.0, 0.3), (0.75, 0.0, 0.0)):
-        other = sheet(*(np.array([at[0] + shifts[0], *at[1:]]) - place[:3, 3]))
+        other = sheet(np.array([at[0] + shifts[0], *at[1:]]) - place[:3, 3], (0.1, 0.001, 0.04))
         kept = not_the_trays(other, tray, place, VOXEL)
         assert len(kept.faces) == (0 if abs(at[1]) in (0.32, 0.31) else 12), at
