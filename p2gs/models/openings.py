@@ -19,6 +19,7 @@ from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import render_depths
 from p2gs.models.free_space import SURFACE, landed, out_of_sight
 from p2gs.models.handover import PartMotions, StateGaussians
+from p2gs.models.islands import find_islands
 from p2gs.models.patches import patches
 from p2gs.models.single_state import render_gaussians
 from p2gs.models.walls import DEEPEST, Backdrop, Walls, over_surface
@@ -29,6 +30,7 @@ from p2gs.types import GaussianTensors
 
 SOLID = 0.3  # opacity from which a Gaussian is surface
 ALIKE = 0.9  # share of the most Gaussians that any backdrop lets give way from which on backdrops are held against the photographs
+APART = 0.25  # share of a part's largest piece below which another one is apart from it
 COVER = 5.0  # pixels, all checked views together, that a patch must cover to be judged
 
 
@@ -36,9 +38,10 @@ COVER = 5.0  # pixels, all checked views together, that a patch must cover to be
 class OpeningsConfig:
     """Options of the room behind openings.
 
-    may_lose: patches give way where the image error over each of them rises to no more than this times what it was; 0 = off. drawers: the
-    same for patches of sliding parts, which have insides that go with them, as doors hardly do. rest: the same for patches most of whose
-    neighbours gave way.
+    may_lose: patches of the base give way where the image error over each of them rises to no more than this times what it was; 0 = off.
+    doors: the same for patches of turning parts, which hardly have insides that go with them, and for pieces that hang apart from their
+    part: in these places nothing can be. drawers: for patches of sliding parts, which have such insides. rest: at least this for patches
+    most of whose neighbours gave way.
     boards: whether flat boards inside (shelves, partitions, bottoms of drawers) are looked for, before which walls are not seen.
     patch: Gaussians a patch. looks, checks: views of a state from which rays are cast, and by which patches are judged; size: their
     long edge in pixels. apart: surfaces that the other state shows within this are confirmed by it; cell: grid of the walls; wall: their
@@ -46,6 +49,7 @@ class OpeningsConfig:
     """
 
     may_lose: float = 1.25
+    doors: float = 3.0
     drawers: float = 1.0
     rest: float = 1.6
     boards: bool = True
@@ -78,16 +82,28 @@ def unconfirmed(g: GaussianTensors, labels: Tensor, transforms: Tensor, other: G
     return out_of_sight(at, stack) & (knn(other.means[solid], at, 1, False)[0][:, 0] > apart)
 
 
-class OneState:
-    """One state's lids and what is behind them: g its Gaussians; lids [N] bool; slides [N] bool: those of sliding parts."""
+BASE, DOOR, DRAWER = range(3)
 
-    def __init__(self, g: GaussianTensors, lids: Tensor, slides: Tensor, views, config: OpeningsConfig, backend: str, device):
+
+def kinds(g: GaussianTensors, labels: Tensor, types: list[str]) -> Tensor:
+    """What each Gaussian is taken for, [N]: the BASE's, a DOOR's (as pieces apart from their part are) or a DRAWER's. labels [N]."""
+    kind = torch.tensor([BASE] + [DRAWER if t == "prismatic" else DOOR for t in types])[labels]
+    solid = (torch.sigmoid(g.opacity_logits) > SOLID).nonzero().squeeze(1)
+    apart = find_islands(g.means[solid], labels[solid], APART) >= 0
+    kind[solid[apart]] = DOOR
+    return kind
+
+
+class OneState:
+    """One state's lids and what is behind them: g its Gaussians; lids [N] bool; kind [N]: see ``kinds``."""
+
+    def __init__(self, g: GaussianTensors, lids: Tensor, kind: Tensor, views, config: OpeningsConfig, backend: str, device):
         self.g, self.views, self.config, self.backend, self.device = g, views, config, backend, device
         self.rows = lids.nonzero().squeeze(1)
         self.patch = patches(g[self.rows], config.patch)
         self.count = int(self.patch.max()) + 1
-        of_slides = torch.zeros(self.count).index_add_(0, self.patch, slides[self.rows].float() - 0.5) > 0
-        self.allowed = torch.where(of_slides, config.drawers, config.may_lose)
+        votes = torch.zeros(self.count, 3).index_put_((self.patch, kind[self.rows]), torch.ones(len(self.rows)), accumulate=True)
+        self.allowed = torch.tensor([config.may_lose, config.doors, config.drawers])[votes.argmax(1)]
         self.level = min(range(len(views.levels)), key=lambda i: abs(views.levels[i] - config.size))
 
     def render(self, g: GaussianTensors, camera, background: Tensor, features: Tensor | None = None):
@@ -207,7 +223,7 @@ class OneState:
         for k in (judged & ~chosen).nonzero().squeeze(1).tolist():
             chosen = self.with_one_more(chosen, k, lambda c: worse(c, allowed))
         amid = judged & ~chosen & self.surrounded(chosen)
-        allowed = torch.where(amid, self.config.rest, allowed)
+        allowed = torch.where(amid, allowed.clamp_min(self.config.rest), allowed)
         for k in amid.nonzero().squeeze(1).tolist():
             chosen = self.with_one_more(chosen, k, lambda c: worse(c, allowed))
         return chosen
@@ -262,7 +278,6 @@ def open_up(
         return out, motions, stacks, counted
     lids = [unconfirmed(g[s], motions.labels[s], away[s], g[1 - s], stacks[1 - s], config.apart) for s in (0, 1)]
     base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
-    slides = torch.tensor([False] + [kind == "prismatic" for kind in motions.types])
     box = torch.quantile(torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0)
     walls = Walls(torch.cat([over_surface(x[k]) for x, k in zip(g, base, strict=True)]), box[0], box[1], config.cell)
     labels, margin, depth = list(motions.labels), list(motions.margin), list(stacks)
@@ -270,7 +285,7 @@ def open_up(
         counted[s]["unconfirmed"] = int(lids[s].sum())
         if int((lids[s] & solid[s]).sum()) < config.patch:
             continue
-        state = OneState(g[s], lids[s], slides[motions.labels[s]], views[s], config, backend, device)
+        state = OneState(g[s], lids[s], kinds(g[s], motions.labels[s], motions.types), views[s], config, backend, device)
         chosen, backdrop = state.choose(state.backdrops(walls, stacks))
         counted[s] |= {"patches": state.count, "boards": backdrop.boards, "gave_way": int(chosen.sum())}
         if not chosen.any():
