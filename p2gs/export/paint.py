@@ -24,14 +24,20 @@ RASTERIZER: ContextVar[str] = ContextVar("rasterizer", default="auto")
 
 
 @contextmanager
-def rasterizer_of(run_dir: Path | str) -> Iterator[str]:
-    """Inside, ``draw`` uses the rasterizer that the run's config names, as training did; "auto" for a folder without a config."""
-    name = run_rasterizer(run_dir)
-    token = RASTERIZER.set(name)
+def drawing_with(rasterizer: str) -> Iterator[str]:
+    """Inside, ``draw`` uses this rasterizer where none is named."""
+    token = RASTERIZER.set(rasterizer)
     try:
-        yield name
+        yield rasterizer
     finally:
         RASTERIZER.reset(token)
+
+
+@contextmanager
+def rasterizer_of(run_dir: Path | str) -> Iterator[str]:
+    """Inside, ``draw`` uses the rasterizer that the run's config names, as training did; "auto" for a folder without a config."""
+    with drawing_with(run_rasterizer(run_dir)) as name:
+        yield name
 
 
 def run_rasterizer(run_dir: Path | str) -> str:

@@ -15,8 +15,9 @@ import torch
 
 from p2gs.export.depth_view import pixel_matrix
 from p2gs.export.integrate import integrate
-from p2gs.export.mesh import BEHIND, RESOLUTION, TRUNCATION, Sightings, mesh_cameras, sight
+from p2gs.export.mesh import mesh_cameras
 from p2gs.export.paint import rasterizer_of
+from p2gs.export.sightings import BEHIND, TRUNCATION, Sightings, sight
 from p2gs.export.tsdf import Mesh
 from p2gs.export.twin_json import load_twin
 from p2gs.export.views import read_cameras
@@ -82,15 +83,15 @@ def texels(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.concatenate(triangle), np.concatenate(weights), np.concatenate(place)
 
 
-def bake(mesh: Mesh, seen: Sightings, part: int, resolution: int = RESOLUTION) -> Texture:
+def bake(mesh: Mesh, seen: Sightings, part: int) -> Texture:
     """The texture of a part's mesh in the start state, from the views of both. part: place in the twin's parts."""
     side, uv = layout(len(mesh.faces))
     triangle, weights, place = texels(len(mesh.faces))
     points = (mesh.vertices[mesh.faces[triangle]] * weights[..., None]).sum(1)
     colour = (mesh.colours[mesh.faces[triangle]] * weights[..., None]).sum(1) / 255
     matrices = [pixel_matrix(v.camera, T) for v, T in zip(seen.views, seen.poses[part], strict=True)]
-    voxel = seen.size / resolution
-    _, weight, tint = integrate(torch.from_numpy(points).float(), seen.views, matrices, part, TRUNCATION * voxel, BEHIND * voxel)
+    reach = (TRUNCATION * seen.voxel, BEHIND * seen.voxel)
+    _, weight, tint = integrate(torch.from_numpy(points).float(), seen.views, matrices, part, *reach)
     told = (weight > 0).numpy()
     colour[told] = tint.numpy()[told]
     image = np.zeros((side, side, 3), np.uint8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Sequence
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from p2gs.data.views import TrainingViews
 from p2gs.losses.base import Loss
 from p2gs.models.canonical import carry, with_static
+from p2gs.models.contents import in_trays
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.islands import settle_twin_islands
@@ -35,7 +37,8 @@ class FinishConfig:
     a smaller share of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
     prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a slide. clean_neighbours: labels are the
     majority among this many neighbours at canonical time (0 = as learned). islands: pieces of a part smaller than this share of its
-    largest go to what they touch (0 = off). exports: simulator formats written at the end of a fit, with meshes and report (empty:
+    largest go to what they touch (0 = off). trays: views of a state by which drawers' trays are found, what is in or on which goes with
+    the drawer (0 = off). exports: simulator formats written at the end of a fit, with meshes and report (empty:
     neither; `p2gs export` makes them later). extend_range: joint limits go on beyond the observed motion until the part touches another
     one (half a turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians whose majority exceeds the rest
     by less are shown as such in the diagnosis (0..1).
@@ -49,6 +52,7 @@ class FinishConfig:
     prismatic_below: float = 5.0
     clean_neighbours: int = 8
     islands: float = 0.25
+    trays: int = 16
     exports: list[str] = field(default_factory=lambda: ["urdf", "mjcf", "glb"])
     extend_range: bool = False
     unclear: float = 0.8
@@ -188,6 +192,10 @@ def finish(
     posed = carry(learned.gaussians, labels, se3.screw_at(T, fuller - time))
     away = se3.inverse(T) if fuller else T
     labels = settle_twin_islands(posed, labels, config.islands, away, stacks[1 - fuller], config.polish.free_static or 0.02)
+    if config.trays > 0:
+        cameras = [(s, views[s].camera(i, -1)) for s in (0, 1) for i in views[s].spread(config.trays)]
+        so_far = assemble(learned.gaussians, labels, types, transforms, time, similarity)
+        labels = in_trays(so_far, cameras, twin_backend or backend)
     found = [state_labels(learned, labels, s, transforms) for s in states]
     record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive)
     options["seed"] = seed
@@ -201,16 +209,29 @@ def finish(
         measure(record, states, types, views, stacks, level, backend, device)
     options["backend"] = twin_backend or backend
     gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
-    parts = [Part(0, None, int((labels == 0).sum()))]
-    for k, kind in enumerate(types):
-        rows = labels == k + 1
-        centre = gaussians.means[rows].double().mean(0)
-        joint = make_joint(kind, transforms[k], se3.apply(se3.screw_at(transforms[k], -time), centre[None])[0])
-        parts.append(Part(k + 1, joint, int(rows.sum()), record.evidence[k].confidence))
-    twin = ArticulatedObject(gaussians, labels, parts, time, similarity)
+    twin = assemble(gaussians, labels, types, transforms, time, similarity, [e.confidence for e in record.evidence])
     if config.extend_range:
         twin.parts = extend_ranges(twin)
     return twin, notes, record
+
+
+def assemble(
+    g: GaussianTensors,
+    labels: Tensor,
+    types: list[str],
+    transforms: Tensor,
+    time: float,
+    similarity: Similarity,
+    confidence: Sequence[float] | None = None,
+) -> ArticulatedObject:
+    """A twin from Gaussians at canonical ``time``, labels [N], and a motion start -> end [K, 4, 4] per moving part."""
+    parts = [Part(0, None, int((labels == 0).sum()))]
+    for k, kind in enumerate(types):
+        rows = labels == k + 1
+        centre = g.means[rows].double().mean(0)
+        joint = make_joint(kind, transforms[k], se3.apply(se3.screw_at(transforms[k], -time), centre[None])[0])
+        parts.append(Part(k + 1, joint, int(rows.sum()), 1.0 if confidence is None else confidence[k]))
+    return ArticulatedObject(g, labels, parts, time, similarity)
 
 
 def measure(

@@ -40,8 +40,7 @@ class OpeningsConfig:
 
     may_lose: patches of the base give way where the image error over each of them rises to no more than this times what it was; 0 = off.
     doors: the same for patches of turning parts, which hardly have insides that go with them, and for pieces that hang apart from their
-    part: in these places nothing can be. drawers: for patches of sliding parts, which have such insides. rest: at least this for patches
-    most of whose neighbours gave way.
+    part. drawers: for patches of sliding parts, which have such insides. rest: at least this for patches most of whose neighbours gave way.
     boards: whether flat boards inside (shelves, partitions, bottoms of drawers) are looked for, before which walls are not seen.
     patch: Gaussians a patch. looks, checks: views of a state from which rays are cast, and by which patches are judged; size: their
     long edge in pixels. apart: surfaces that the other state shows within this are confirmed by it; cell: grid of the walls; wall: their

@@ -8,7 +8,8 @@ from toy import ring, toy_scene, toy_twin
 from traced import boards, seen
 
 from p2gs.export.formats import export_run
-from p2gs.export.mesh import Sightings, write_meshes
+from p2gs.export.mesh import write_meshes
+from p2gs.export.sightings import Sightings
 from p2gs.export.run_folder import write_twin
 from p2gs.export.texture import TILE, Texture, bake, layout, texels
 from p2gs.export.tsdf import Mesh, fuse
@@ -75,7 +76,7 @@ def test_a_texture_is_finer_than_vertices():
         views.append(view)
     poses = [torch.eye(4, dtype=torch.float64)] * len(views)
     mesh = fuse(views, poses, 0, VOXEL, 4 * VOXEL, 2 * VOXEL)
-    texture = bake(mesh, Sightings(1.0, views, [], [poses]), 0, resolution=round(1 / VOXEL))
+    texture = bake(mesh, Sightings(VOXEL, views, [], [poses]), 0)
     which, w = within(len(mesh.faces), 20000)
     points = (mesh.vertices[mesh.faces[which]] * w[..., None]).sum(1)
     top = (np.abs(points[:, 2] - 0.1) < 0.2 * VOXEL) & (np.abs(points[:, :2]) < [0.4, 0.3]).all(1)

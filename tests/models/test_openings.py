@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from tiny import look_at
 
@@ -10,7 +11,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.openings import OpeningsConfig, open_up, unconfirmed
+from p2gs.models.openings import BASE, DOOR, DRAWER, OpeningsConfig, kinds, open_up, unconfirmed
 from p2gs.models.patches import patches
 from p2gs.models.walls import Backdrop, Walls, over_surface
 from p2gs.ops import se3
@@ -126,16 +127,27 @@ def test_what_the_photographs_tell_stays():
     assert counted[1]["removed"] <= 0.1 * len(shelf)
 
 
-def test_a_drawers_inside_must_not_be_explained_worse_at_all():
+@pytest.mark.parametrize("kind", ["base", "revolute", "prismatic"])
+def test_each_kind_may_be_explained_worse_by_its_own_measure(kind):
     lid = panel([-0.37, 0.2, -0.27], [0.74, 0, 0], [0, 0, 0.54], DARK)
     states, motions, views, stacks = scene(lid, [panel(*side, DARK) for side in INSIDE])
-    none = OpeningsConfig(may_lose=1e-3, drawers=100.0)
-    assert open_up(states, motions, views, stacks, none, backend="auto")[3][1]["removed"] == 0  # the lid is no slide's
-    slide = torch.eye(4).double()
-    slide[1, 3] = 0.1
-    motions = replace(motions, types=["revolute", "prismatic"], transforms=torch.stack([HINGE, slide]), confidence=torch.ones(2))
-    motions.labels[1][-len(lid) :] = 2
-    assert open_up(states, motions, views, stacks, none, backend="auto")[3][1]["removed"] > 0
+    if kind != "base":
+        forth = torch.eye(4).double()
+        forth[1, 3] = 0.1
+        motions = replace(motions, types=["revolute", kind], transforms=torch.stack([HINGE, forth]), confidence=torch.ones(2))
+        motions.labels[1][-len(lid) :] = 2
+    names = {"base": "may_lose", "revolute": "doors", "prismatic": "drawers"}
+    for told in names:
+        config = OpeningsConfig(**{name: 100.0 if k == told else 1e-3 for k, name in names.items()})
+        removed = open_up(states, motions, views, stacks, config, backend="auto")[3][1]["removed"]
+        assert (removed > 0) == (told == kind), told
+
+
+def test_what_hangs_apart_from_a_drawer_is_taken_for_a_doors():
+    groups = [outer(), panel([0, 0.5, 0], [0.5, 0, 0], [0, 0, 0.3], DARK), panel([0, 0.8, 0], [0.1, 0, 0], [0, 0, 0.1], DARK), door()]
+    labels = torch.cat([torch.full((len(g),), k) for g, k in zip(groups, (0, 1, 1, 2), strict=True)])
+    want = torch.cat([torch.full((len(g),), k) for g, k in zip(groups, (BASE, DRAWER, DOOR, DOOR), strict=True)])
+    assert torch.equal(kinds(GaussianTensors.cat(groups), labels, ["prismatic", "revolute"]), want)
 
 
 def test_states_without_an_object_are_left_to_fusion():

@@ -1,0 +1,75 @@
+"""What is in a drawer goes with it: labels of the Gaussians on and in trays that stand open.
+
+A side of an opened drawer may be labelled as a door's, for the door's motion happens to lay it on some surface of the other state. Once
+the parts' surfaces are there they tell where an open drawer's tray is, and that no other part can be there. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from typing import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from p2gs.export.paint import drawing_with
+from p2gs.export.pose import pose
+from p2gs.export.sightings import sight
+from p2gs.export.trays import Tray
+from p2gs.ops import se3
+from p2gs.types import ArticulatedObject, Camera
+
+RESOLUTION = 100  # voxels along the longest side of the object's box: trays are large
+NEAR = 0.0125  # of that side: nearer than this to a side of a tray is on it
+
+
+def depth_within(points: np.ndarray, tray: Tray) -> np.ndarray:
+    """How far within each of a tray's six sides points [N, 3], in its axes, are; negative outside, [N, 6]: first those at ``tray.lo``."""
+    return np.concatenate([points - tray.lo, tray.hi - points], 1)
+
+
+def belongs(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
+    """Which points [N, 3], in a tray's axes, are in it or within ``near`` of a side of it, [N] bool.
+
+    Not in its mouth, though: what closes that is a lid, of which nobody knows whose it is.
+    """
+    within = depth_within(points, tray)
+    mouth = 3 * tray.mouth[1] + 1 + tray.mouth[0]
+    on_side = (np.abs(np.delete(within, mouth, 1)) < near).any(1)
+    return (within > -near).all(1) & (on_side | (within[:, mouth] > 2 * near))
+
+
+def out_of_body(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
+    """Which points [N, 3], in a tray's axes, are behind its front and, while it is open, before what it slides out of, [N] bool."""
+    return points[:, 0] > tray.front.back - tray.travel + near
+
+
+@torch.no_grad()
+def in_trays(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], backend: str = "auto") -> Tensor:
+    """Labels [N] of a twin's Gaussians, those in or on a tray that stands open its own; of the base's only what is out of the body.
+
+    obj and cameras ((state, camera) pairs) in one coordinate system. The base is part 0, parts are numbered as they come.
+    """
+    labels = obj.part_ids.clone()
+    sliding = [k for k, p in enumerate(obj.parts) if p.joint is not None and p.joint.type == "prismatic"]
+    if not sliding:
+        return labels
+    with drawing_with(backend):
+        seen = sight(obj, cameras, RESOLUTION)
+    body, near = seen.surface(0), NEAR * RESOLUTION * seen.voxel
+    trays, places = {}, {}
+    for k in sliding:
+        surface = seen.surface(k)
+        tray = seen.tray(k, surface, body) if len(surface.faces) and len(body.faces) else None
+        if tray is not None:
+            trays[k] = tray
+            open_at = pose(obj, float(tray.drawn)).means.double()
+            places[k] = se3.apply(se3.inverse(seen.motions[k][tray.drawn]), open_at).numpy() @ tray.front.axes.T
+    deepest = {k: depth_within(places[k], tray).min(1) for k, tray in trays.items()}
+    for k, tray in trays.items():
+        mine = belongs(places[k], tray, near)
+        mine &= (obj.part_ids != 0).numpy() | out_of_body(places[k], tray, 1.5 * near)
+        for j in trays:  # what is on another tray of its own
+            mine &= (obj.part_ids != j).numpy() | (deepest[j] <= deepest[k])
+        labels[torch.from_numpy(mine)] = k
+    return labels
