@@ -14,6 +14,7 @@ from p2gs.types import UserError
 Exporter = Callable[[Asset, Path], Path]
 EXPORTERS: Registry[Exporter] = Registry("export format")
 DEFAULT_UP = {"glb": "y"}  # glTF's rule; the others take the input's z
+UNTEXTURED = {"ply"}
 FOR_LOOKS = {"glb", "ply", "obj"}  # hold no collision pieces or masses, which take most of an export's time
 
 
@@ -89,12 +90,14 @@ def export_run(
     scale: metres per input unit.  up: z, y or x, by default what the format expects.  origin: keep, center or bottom.
     extend_range: joint limits go on beyond the observed motion until parts touch (twin.json keeps what was observed).
     texture: parts get baked textures in every format but PLY, which knows none.
-    Raises UserError for an unknown format, with the nearest name.
+    Raises UserError for an unknown format, with the nearest name, and for textures that no named format holds.
     """
     names = list(dict.fromkeys(n for f in formats for n in (EXPORTERS if f == "all" else [f])))
     if not names:
         raise UserError(f"no export format given; known: {', '.join(EXPORTERS)}")
     writers = {name: EXPORTERS[name] for name in names}
+    if texture and UNTEXTURED.issuperset(names):
+        raise UserError(f"--texture: {', '.join(names)} holds vertex colours and no textures; name another format as well, or leave it out")
     out = Path(out) if out is not None else Path(run_dir)
     out.mkdir(parents=True, exist_ok=True)
     axes = {name: up or DEFAULT_UP.get(name, "z") for name in writers}

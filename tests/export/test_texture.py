@@ -9,10 +9,11 @@ from traced import boards, seen
 
 from p2gs.export.formats import export_run
 from p2gs.export.mesh import write_meshes
-from p2gs.export.sightings import Sightings
 from p2gs.export.run_folder import write_twin
+from p2gs.export.sightings import Sightings
 from p2gs.export.texture import TILE, Texture, bake, layout, texels
 from p2gs.export.tsdf import Mesh, fuse
+from p2gs.types import UserError
 
 VOXEL = 0.04
 
@@ -160,3 +161,8 @@ def test_pictures_of_an_earlier_export_go(run, tmp_path):
         and mine.is_file()
         and "<color" in (tmp_path / "twin.urdf").read_text()
     )
+
+
+def test_a_format_without_textures_says_so(run, tmp_path):
+    with pytest.raises(UserError, match="--texture: ply"):
+        export_run(run, ["ply"], tmp_path, texture=True)
