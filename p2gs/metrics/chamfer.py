@@ -210,7 +210,8 @@ def evaluate_chamfer(
 
     pred, gt: state name ("start", "end") -> meshes, the states of ``gt`` are evaluated.  assignment: gt movable part -> predicted one
     (``JointReport.assignment`` or ``match_parts``).  clean: components of a *predicted* mesh below this fraction of its largest are
-    dropped (ground truth is taken as it is, interior faces included).
+    dropped (ground truth is taken as it is, interior faces included); a whole that is its parts joined is what is left of these: a door
+    may well have fewer triangles than a tenth of the base.
 
     >>> box = PlainMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
     >>> shift = PlainMesh(box.vertices + [0, 0, 0.1], box.faces)
@@ -221,9 +222,10 @@ def evaluate_chamfer(
     """
 
     def score(p: Mesh | None, g: Mesh | None) -> float | None:
-        if is_empty(p) or is_empty(g):
-            return None
-        return mesh_chamfer(largest_components(p, clean) if clean > 0 else p, g, count, seeds)
+        return None if is_empty(p) or is_empty(g) else mesh_chamfer(p, g, count, seeds)
+
+    def cleaned(mesh: Mesh | None) -> Mesh | None:
+        return mesh if mesh is None or clean <= 0 else largest_components(mesh, clean)
 
     def floor(meshes: Sequence[Mesh | None]) -> list[float]:
         return [mesh_chamfer(g, g, count, seeds) for g in meshes if not is_empty(g)]
@@ -231,7 +233,8 @@ def evaluate_chamfer(
     static, whole, parts = [], [], []
     floors = {"static": [], "movable": [], "whole": []}
     for state, truth in gt.items():
-        found = pred[state]
+        made = pred[state]
+        found = PartMeshes(cleaned(made.static), [cleaned(m) for m in made.movable], cleaned(made.whole))
         static.append(score(found.static, truth.static))
         whole.append(score(found.all, truth.all))
         partners = [found.movable[assignment[i]] if i in assignment else None for i in range(len(truth.movable))]

@@ -34,26 +34,39 @@ def belongs(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
     Not in its mouth, though: what closes that is a lid, of which nobody knows whose it is.
     """
     within = depth_within(points, tray)
+    return (within > -near).all(1) & ~in_mouth(within, tray, near)
+
+
+def in_mouth(within: np.ndarray, tray: Tray, near: float) -> np.ndarray:
+    """Which points, so far ``within`` [N, 6] a tray's sides, are in its mouth or before it, away from the other sides, [N] bool."""
     mouth = 3 * tray.mouth[1] + 1 + tray.mouth[0]
-    on_side = (np.abs(np.delete(within, mouth, 1)) < near).any(1)
-    return (within > -near).all(1) & (on_side | (within[:, mouth] > 2 * near))
+    return (within[:, mouth] < 2 * near) & (np.delete(within, mouth, 1) > near).all(1)
+
+
+def beside(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
+    """Which points [N, 3], in a tray's axes, are where its front was before the drawer was opened, but for its mouth, [N] bool: no
+    other moving part can be there."""
+    front, within = tray.front, depth_within(points, tray)
+    passed = ((points[:, 1:] > front.lo) & (points[:, 1:] < front.hi)).all(1) & (points[:, 0] < front.back) & out_of_body(points, tray, 0)
+    return passed & (within[:, 3 * tray.mouth[1] + 1 + tray.mouth[0]] > -near) & ~in_mouth(within, tray, near)
 
 
 def out_of_body(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
-    """Which points [N, 3], in a tray's axes, are behind its front and, while it is open, before what it slides out of, [N] bool."""
+    """Which points [N, 3], in a tray's axes, are by more than ``near`` before what the drawer slides out of, while it is open, [N] bool."""
     return points[:, 0] > tray.front.back - tray.travel + near
 
 
 @torch.no_grad()
-def in_trays(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], backend: str = "auto") -> Tensor:
-    """Labels [N] of a twin's Gaussians, those in or on a tray that stands open its own; of the base's only what is out of the body.
+def in_trays(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], backend: str = "auto") -> tuple[Tensor, Tensor]:
+    """Labels [N] of a twin's Gaussians, those in or on a tray that stands open its own (of the base's only what is out of the body); and
+    which are so their drawer's now, [N] bool.
 
     obj and cameras ((state, camera) pairs) in one coordinate system. The base is part 0, parts are numbered as they come.
     """
-    labels = obj.part_ids.clone()
+    labels, none = obj.part_ids.clone(), torch.zeros(len(obj.part_ids), dtype=torch.bool)
     sliding = [k for k, p in enumerate(obj.parts) if p.joint is not None and p.joint.type == "prismatic"]
     if not sliding:
-        return labels
+        return labels, none
     with drawing_with(backend):
         seen = sight(obj, cameras, RESOLUTION)
     body, near = seen.surface(0), NEAR * RESOLUTION * seen.voxel
@@ -66,10 +79,12 @@ def in_trays(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], back
             open_at = pose(obj, float(tray.drawn)).means.double()
             places[k] = se3.apply(se3.inverse(seen.motions[k][tray.drawn]), open_at).numpy() @ tray.front.axes.T
     deepest = {k: depth_within(places[k], tray).min(1) for k, tray in trays.items()}
+    reach, still = {}, (obj.part_ids == 0).numpy()
     for k, tray in trays.items():
-        mine = belongs(places[k], tray, near)
-        mine &= (obj.part_ids != 0).numpy() | out_of_body(places[k], tray, 1.5 * near)
+        on = belongs(places[k], tray, near)
+        reach[k] = np.where(still, on & out_of_body(places[k], tray, near), on | beside(places[k], tray, near))
+        mine = reach[k].copy()
         for j in trays:  # what is on another tray of its own
             mine &= (obj.part_ids != j).numpy() | (deepest[j] <= deepest[k])
         labels[torch.from_numpy(mine)] = k
-    return labels
+    return labels, sum(((labels == k) & torch.from_numpy(r) for k, r in reach.items()), none)

@@ -189,13 +189,17 @@ def finish(
     level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
     fuller, T = round(time), with_static(transforms)  # the state that shows more
-    posed = carry(learned.gaussians, labels, se3.screw_at(T, fuller - time))
-    away = se3.inverse(T) if fuller else T
-    labels = settle_twin_islands(posed, labels, config.islands, away, stacks[1 - fuller], config.polish.free_static or 0.02)
-    if config.trays > 0:
+    away, tau = se3.inverse(T) if fuller else T, config.polish.free_static or 0.02
+
+    def without_islands(labels: Tensor, held: Tensor | None = None) -> Tensor:
+        posed = carry(learned.gaussians, labels, se3.screw_at(T, fuller - time))
+        return settle_twin_islands(posed, labels, config.islands, away, stacks[1 - fuller], tau, held)
+
+    labels = without_islands(labels)
+    if config.trays > 0 and "prismatic" in types:
         cameras = [(s, views[s].camera(i, -1)) for s in (0, 1) for i in views[s].spread(config.trays)]
         so_far = assemble(learned.gaussians, labels, types, transforms, time, similarity)
-        labels = in_trays(so_far, cameras, twin_backend or backend)
+        labels = without_islands(*in_trays(so_far, cameras, twin_backend or backend))
     found = [state_labels(learned, labels, s, transforms) for s in states]
     record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive)
     options["seed"] = seed

@@ -80,12 +80,15 @@ def settle_islands(states: list[GaussianTensors], labels: list[Tensor], transfor
 
 
 @torch.no_grad()
-def settle_twin_islands(g: GaussianTensors, labels: Tensor, share: float, away: Tensor, stack: DepthStack, tau: float) -> Tensor:
+def settle_twin_islands(
+    g: GaussianTensors, labels: Tensor, share: float, away: Tensor, stack: DepthStack, tau: float, held: Tensor | None = None
+) -> Tensor:
     """Labels [N] of a twin, posed in one state, with islands given to what they touch there.
 
     The twin holds what both states show of a part: a piece that hangs apart from it here has no counterpart elsewhere to speak for it. It
     stays nevertheless where the other state's cameras would see through more of it under the new label than under the old.
     away [K, 4, 4]: motions to the other state, slot 0 included; stack: its rendered depth; tau: tolerance along the ray (scene units).
+    held [N] bool: known to be their part's; what holds more of these than others is no island.
     """
     rows = (torch.sigmoid(g.opacity_logits) > SOLID).nonzero().squeeze(1)
     if share <= 0 or len(rows) < 10:
@@ -99,7 +102,12 @@ def settle_twin_islands(g: GaussianTensors, labels: Tensor, share: float, away: 
     def fits(piece: Tensor, part: int) -> bool:
         return seen_through(piece, part) <= seen_through(piece, int(old[piece[0]])) + 0.02
 
-    return _with_faint(g.means, labels, rows, _settle(points, old, find_islands(points, old, share), fits=fits))
+    island = find_islands(points, old, share)
+    if held is not None:
+        for piece in island[island >= 0].unique():
+            if float(held[rows][island == piece].float().mean()) > 0.5:
+                island[island == piece] = -1
+    return _with_faint(g.means, labels, rows, _settle(points, old, island, fits=fits))
 
 
 def _with_faint(means: Tensor, labels: Tensor, rows: Tensor, new: Tensor) -> Tensor:

@@ -101,6 +101,17 @@ def test_an_object_is_scored_by_part_and_state():
     assert exact.whole == pytest.approx(C.sampling_floor(C.surface_area(gt["start"].all), 2000), rel=0.1)
 
 
+def test_a_part_of_few_triangles_is_part_of_the_whole_and_crumbs_are_not():
+    base, door = box((2, 2, 2)).subdivide().subdivide(), box((0.5, 1, 1), (3, 0, 0))
+    assert len(door.faces) < 0.1 * len(base.faces)
+    crumb = box((0.1, 0.1, 0.1), (5, 0, 0))
+    crumbs = C.PlainMesh(np.concatenate([base.vertices, crumb.vertices]), np.concatenate([base.faces, crumb.faces + len(base.vertices)]))
+    gt, pred = states(base, [door]), states(crumbs, [door])
+    report = C.evaluate_chamfer(pred, gt, {0: 0}, seeds=(0,))
+    assert report.whole == pytest.approx(report.floors["whole"], rel=0.1)
+    assert C.evaluate_chamfer(pred, gt, {0: 0}, seeds=(0,), clean=0.0).whole > 1.2 * report.whole
+
+
 def test_missing_parts_fail_and_are_counted():
     base, door = box((2, 2, 2)), box((0.5, 1, 1), (3, 0, 0))
     gt, pred = states(base, [door]), states(base, [])
