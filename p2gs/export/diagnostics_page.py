@@ -177,6 +177,8 @@ def _finish(d: dict) -> list[str]:
     if ways:
         rows = [[k.replace("_", " "), _number(w["before"]), _number(w["after"])] for k, w in ways]
         out.append(table(["image loss", "before the polish", "after"], rows))
+    if p["contents"]:
+        out.append(f'<p class="soft">{p["contents"]:,} Gaussians became a drawer\'s: they are on or in its open tray</p>')
     rows = [[k.replace("_", " "), _number(r["static"]), _share(r["bright_static"])] for k, r in d["residuals"].items()]
     out.append(table(["moved into the other state", "residual of the static part", "of the object wrong though static"], rows))
     polish = {j["part"]: j for j in p["joints"]}

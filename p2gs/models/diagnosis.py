@@ -256,9 +256,11 @@ def apart(a: Tensor, b: Tensor, points: Tensor) -> tuple[float, float]:
 
 
 def polishing(record: FinishRecord, twin: ArticulatedObject, states, unit: float) -> dict:
-    """Image loss of each direction before and after the last refinement; per joint what it changed and how the two directions differ."""
+    """Image loss of each direction before and after the last refinement, what became a drawer's; per joint what the refinement changed and
+    how the two directions differ."""
     names = ("start_to_end", "end_to_start")
     out = {n: {w: record.costs[w][i] for w in record.costs} for i, n in enumerate(names)} if record.costs else {}
+    out["contents"] = record.contents
     out["joints"] = []
     for k, part in enumerate(twin.parts[1:]):
         points = states[0].gaussians.means[record.labels[0] == k + 1]

@@ -65,7 +65,7 @@ class FinishRecord:
     labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the polish
     (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
     start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.  slots: the
-    learned slot of each part.
+    learned slot of each part.  contents: Gaussians that became a drawer's because they are on or in its tray.
     """
 
     labels: list[Tensor]
@@ -76,6 +76,7 @@ class FinishRecord:
     costs: dict[str, list[float]] = field(default_factory=dict)
     evidence: list[JointEvidence] = field(default_factory=list)
     slots: list[int] = field(default_factory=list)
+    contents: int = 0
 
 
 @PHASES.register("finish")
@@ -188,20 +189,10 @@ def finish(
     options = {"backend": backend, "device": device}
     level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
-    fuller, T = round(time), with_static(transforms)  # the state that shows more
-    away, tau = se3.inverse(T) if fuller else T, config.polish.free_static or 0.02
-
-    def without_islands(labels: Tensor, held: Tensor | None = None) -> Tensor:
-        posed = carry(learned.gaussians, labels, se3.screw_at(T, fuller - time))
-        return settle_twin_islands(posed, labels, config.islands, away, stacks[1 - fuller], tau, held)
-
-    labels = without_islands(labels)
-    if config.trays > 0 and "prismatic" in types:
-        cameras = [(s, views[s].camera(i, -1)) for s in (0, 1) for i in views[s].spread(config.trays)]
-        so_far = assemble(learned.gaussians, labels, types, transforms, time, similarity)
-        labels = without_islands(*in_trays(so_far, cameras, twin_backend or backend))
+    twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
+    labels, contents = settle_labels(twin, views, stacks, config, twin_backend or backend)
     found = [state_labels(learned, labels, s, transforms) for s in states]
-    record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive)
+    record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive, contents=contents)
     options["seed"] = seed
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
@@ -217,6 +208,30 @@ def finish(
     if config.extend_range:
         twin.parts = extend_ranges(twin)
     return twin, notes, record
+
+
+def settle_labels(
+    twin: ArticulatedObject, views: dict[int, TrainingViews], stacks: list[DepthStack], config: FinishConfig, backend: str
+) -> tuple[Tensor, int]:
+    """Labels [N] without islands, what is in drawers with these; and to how many Gaussians the latter happened.
+
+    twin: as learned, internal coordinates; views: photographs by state; stacks: rendered depth of both states; backend: draws the twin.
+    """
+    fuller = round(twin.canonical_time)  # the state that shows more
+    T = with_static(torch.stack([p.joint.transform for p in twin.parts[1:]])) if len(twin.parts) > 1 else torch.eye(4).double()[None]
+    away, tau = se3.inverse(T) if fuller else T, config.polish.free_static or 0.02
+
+    def without_islands(labels: Tensor, held: Tensor | None = None) -> Tensor:
+        posed = carry(twin.gaussians, labels, se3.screw_at(T, fuller - twin.canonical_time))
+        return settle_twin_islands(posed, labels, config.islands, away, stacks[1 - fuller], tau, held)
+
+    labels = without_islands(twin.part_ids)
+    if config.trays <= 0:
+        return labels, 0
+    cameras = [(s, views[s].camera(i, -1)) for s in (0, 1) for i in views[s].spread(config.trays)]
+    settled, held = in_trays(replace(twin, part_ids=labels), cameras, backend)
+    count = int((settled != labels).sum())
+    return without_islands(settled, held) if count else labels, count
 
 
 def assemble(

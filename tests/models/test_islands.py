@@ -141,3 +141,7 @@ def test_a_twins_island_goes_to_what_it_touches_unless_that_is_seen_through(wall
     found = settle_twin_islands(solid(points), wrong, 0.25, away, stack, 0.02)
     assert torch.equal(found, right if wall_in_front else wrong)
     assert settle_twin_islands(solid(points), wrong, 0.0, away, stack, 0.02) is wrong
+    held = torch.zeros(len(points), dtype=torch.bool)
+    held[wrong != right] = True  # known to be its part's
+    assert torch.equal(settle_twin_islands(solid(points), wrong, 0.25, away, stack, 0.02, held), wrong)
+    assert torch.equal(settle_twin_islands(solid(points), wrong, 0.25, away, stack, 0.02, ~held), found)
