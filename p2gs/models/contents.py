@@ -44,7 +44,7 @@ def in_mouth(within: np.ndarray, tray: Tray, near: float) -> np.ndarray:
 
 
 def beside(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
-    """Which points [N, 3], in a tray's axes, are where its front was before the drawer was opened, but for its mouth, [N] bool: no
+    """Which points [N, 3], in a tray's axes, are where its front was or passed before the drawer was open, but for its mouth, [N] bool: no
     other moving part can be there."""
     front, within = tray.front, depth_within(points, tray)
     passed = ((points[:, 1:] > front.lo) & (points[:, 1:] < front.hi)).all(1) & (points[:, 0] < front.back) & out_of_body(points, tray, 0)
@@ -61,7 +61,7 @@ def in_trays(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], back
     """Labels [N] of a twin's Gaussians, those in or on a tray that stands open its own (of the base's only what is out of the body); and
     which are so their drawer's now, [N] bool.
 
-    obj and cameras ((state, camera) pairs) in one coordinate system. The base is part 0, parts are numbered as they come.
+    obj and cameras ((state, camera) pairs) in one coordinate system; parts have their places as ids, the base 0.
     """
     labels, none = obj.part_ids.clone(), torch.zeros(len(obj.part_ids), dtype=torch.bool)
     sliding = [k for k, p in enumerate(obj.parts) if p.joint is not None and p.joint.type == "prismatic"]
@@ -84,7 +84,7 @@ def in_trays(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], back
         on = belongs(places[k], tray, near)
         reach[k] = np.where(still, on & out_of_body(places[k], tray, near), on | beside(places[k], tray, near))
         mine = reach[k].copy()
-        for j in trays:  # what is on another tray of its own
-            mine &= (obj.part_ids != j).numpy() | (deepest[j] <= deepest[k])
+        for j in trays:  # what is rather on another's
+            mine &= (labels != j).numpy() | (deepest[j] <= deepest[k])
         labels[torch.from_numpy(mine)] = k
     return labels, sum(((labels == k) & torch.from_numpy(r) for k, r in reach.items()), none)

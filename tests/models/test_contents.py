@@ -7,7 +7,7 @@ from test_openings import panel
 from toy import ring
 
 from p2gs.export.trays import Front, Tray
-from p2gs.models.contents import belongs, in_trays, out_of_body
+from p2gs.models.contents import belongs, beside, in_trays, out_of_body
 from p2gs.models.finish import assemble
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors, Similarity
@@ -100,4 +100,14 @@ def test_on_a_side_in_the_box_but_not_in_the_mouth():
         (0.2, 0.0, 0.2): False,
     }
     assert belongs(np.array(list(points)), tray, 0.02).tolist() == list(points.values())
+    points = {
+        (0.3, 0.36, 0.0): True,  # between the tray and the edge of what its front passed
+        (0.3, 0.41, 0.0): False,
+        (0.1, 0.36, 0.0): False,  # in the body
+        (0.55, 0.36, 0.0): False,  # before the front
+        (0.3, 0.0, -0.19): True,
+        (0.3, 0.36, 0.15): False,  # before the mouth
+        (0.3, 0.0, 0.09): False,
+    }
+    assert beside(np.array(list(points)), tray, 0.02).tolist() == list(points.values())
     assert out_of_body(np.array([[0.2, 0, 0], [0.16, 0, 0], [0.0, 0, 0]]), tray, 0.02).tolist() == [True, False, False]
