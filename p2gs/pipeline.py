@@ -305,6 +305,7 @@ class Pipeline:
 
     def write(self, learned: handover.Articulation, found_in, states, canonical, motions) -> dict:
         """The twin and the result folder; returns what a later run needs to know of it. found_in: the states before they were sharpened."""
+        from p2gs.export.contents import in_trays
         from p2gs.export.diagnostics_page import write_diagnosis
         from p2gs.export.run_folder import complete_run, write_twin
 
@@ -319,6 +320,7 @@ class Pipeline:
             seed=self.cfg.seed,
             backend=self.backend,
             twin_backend=self.cfg.rasterizer,
+            contents=in_trays,
             device=device,
         )
         for note in notes:

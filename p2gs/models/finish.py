@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Sequence
+from typing import Callable, Optional, Sequence
 
 import torch
 from torch import Tensor
@@ -11,7 +11,6 @@ from torch import Tensor
 from p2gs.data.views import TrainingViews
 from p2gs.losses.base import Loss
 from p2gs.models.canonical import carry, with_static
-from p2gs.models.contents import in_trays
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.islands import settle_twin_islands
@@ -23,7 +22,9 @@ from p2gs.models.screw_polish import PolishConfig, photometric_cost
 from p2gs.models.tune import TuneConfig, tune
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
-from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
+from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, Part, Similarity
+
+Contents = Callable[[ArticulatedObject, Sequence[tuple[int, Camera]], str], tuple[Tensor, Tensor]]  # ``p2gs.export.contents.in_trays``
 
 UNKNOWN = 4.0  # a state's Gaussian farther than this from the twin, in the median's units, is none of the twin's
 
@@ -160,12 +161,14 @@ def finish(
     seed: int,
     backend: str,
     twin_backend: str | None = None,
+    contents: Optional[Contents] = None,
     device="cpu",
 ) -> tuple[ArticulatedObject, list[str], FinishRecord]:
     """The twin, one line for each slot that vanished, and what was measured on the way.
 
     views: photographs by state.  losses: those of the last training phase, for ``tune`` (None: it is left out).  backend: draws the states,
-    twin_backend: the twin in ``tune`` (None: the same).  A part's confidence is ``JointEvidence.confidence`` of its joint.
+    twin_backend: the twin in ``tune`` (None: the same).  contents: finds what is in drawers (None: nobody does).  A part's confidence
+    is ``JointEvidence.confidence`` of its joint.
     """
     labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
     alive = surviving_slots(learned, labels, config)
@@ -190,9 +193,9 @@ def finish(
     level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
     twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
-    labels, contents = settle_labels(twin, views, stacks, config, twin_backend or backend)
+    labels, moved = settle_labels(twin, views, stacks, config, contents, twin_backend or backend)
     found = [state_labels(learned, labels, s, transforms) for s in states]
-    record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive, contents=contents)
+    record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive, contents=moved)
     options["seed"] = seed
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
@@ -211,11 +214,17 @@ def finish(
 
 
 def settle_labels(
-    twin: ArticulatedObject, views: dict[int, TrainingViews], stacks: list[DepthStack], config: FinishConfig, backend: str
+    twin: ArticulatedObject,
+    views: dict[int, TrainingViews],
+    stacks: list[DepthStack],
+    config: FinishConfig,
+    contents: Optional[Contents],
+    backend: str,
 ) -> tuple[Tensor, int]:
     """Labels [N] without islands, what is in drawers with these; and to how many Gaussians the latter happened.
 
-    twin: as learned, internal coordinates; views: photographs by state; stacks: rendered depth of both states; backend: draws the twin.
+    twin: as learned, internal coordinates; views: photographs by state; stacks: rendered depth of both states; contents: finds what is in
+    drawers; backend: draws the twin for it.
     """
     fuller = round(twin.canonical_time)  # the state that shows more
     T = with_static(torch.stack([p.joint.transform for p in twin.parts[1:]])) if len(twin.parts) > 1 else torch.eye(4).double()[None]
@@ -226,10 +235,10 @@ def settle_labels(
         return settle_twin_islands(posed, labels, config.islands, away, stacks[1 - fuller], tau, held)
 
     labels = without_islands(twin.part_ids)
-    if config.trays <= 0:
+    if config.trays <= 0 or contents is None:
         return labels, 0
     cameras = [(s, views[s].camera(i, -1)) for s in (0, 1) for i in views[s].spread(config.trays)]
-    settled, held = in_trays(replace(twin, part_ids=labels), cameras, backend)
+    settled, held = contents(replace(twin, part_ids=labels), cameras, backend)
     count = int((settled != labels).sum())
     return without_islands(settled, held) if count else labels, count
 

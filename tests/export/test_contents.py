@@ -6,8 +6,9 @@ import torch
 from test_openings import panel
 from toy import ring
 
+from p2gs.export.contents import belongs, beside, in_trays, out_of_body
+from p2gs.export.pose import pose
 from p2gs.export.trays import Front, Tray
-from p2gs.models.contents import belongs, beside, in_trays, out_of_body
 from p2gs.models.finish import assemble
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors, Similarity
@@ -55,8 +56,6 @@ def twin(time: float, shut_at: float):
 
 def in_the_drawer(obj, shut_at, drawn):
     """Where Gaussians are in the drawer's own coordinates, as it is shut, while it is open."""
-    from p2gs.export.pose import pose
-
     out = pose(obj, drawn).means.double()
     return se3.apply(se3.screw_at(obj.parts[1].joint.transform, shut_at - drawn), out)
 
