@@ -23,32 +23,26 @@ RESOLUTION = 100  # voxels along the longest side of the object's box: trays are
 NEAR = 0.0125  # of that side: nearer than this to a side of a tray is on it
 
 
-def depth_within(points: np.ndarray, tray: Tray) -> np.ndarray:
-    """How far within each of a tray's six sides points [N, 3], in its axes, are; negative outside, [N, 6]: first those at ``tray.lo``."""
-    return np.concatenate([points - tray.lo, tray.hi - points], 1)
-
-
 def belongs(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
     """Which points [N, 3], in a tray's axes, are in it or within ``near`` of a side of it, [N] bool.
 
     Not in its mouth, though: what closes that is a lid, of which nobody knows whose it is.
     """
-    within = depth_within(points, tray)
+    within = tray.within(points)
     return (within > -near).all(1) & ~in_mouth(within, tray, near)
 
 
 def in_mouth(within: np.ndarray, tray: Tray, near: float) -> np.ndarray:
     """Which points, so far ``within`` [N, 6] a tray's sides, are in its mouth or before it, away from the other sides, [N] bool."""
-    mouth = 3 * tray.mouth[1] + 1 + tray.mouth[0]
-    return (within[:, mouth] < 2 * near) & (np.delete(within, mouth, 1) > near).all(1)
+    return (within[:, tray.mouth_side] < 2 * near) & (np.delete(within, tray.mouth_side, 1) > near).all(1)
 
 
 def beside(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
     """Which points [N, 3], in a tray's axes, are where its front was or passed before the drawer was open, but for its mouth, [N] bool: no
     other moving part can be there."""
-    front, within = tray.front, depth_within(points, tray)
+    front, within = tray.front, tray.within(points)
     passed = ((points[:, 1:] > front.lo) & (points[:, 1:] < front.hi)).all(1) & (points[:, 0] < front.back) & out_of_body(points, tray, 0)
-    return passed & (within[:, 3 * tray.mouth[1] + 1 + tray.mouth[0]] > -near) & ~in_mouth(within, tray, near)
+    return passed & (within[:, tray.mouth_side] > -near) & ~in_mouth(within, tray, near)
 
 
 def out_of_body(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
@@ -63,28 +57,31 @@ def in_trays(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], back
 
     obj and cameras ((state, camera) pairs) in one coordinate system; parts have their places as ids, the base 0.
     """
-    labels, none = obj.part_ids.clone(), torch.zeros(len(obj.part_ids), dtype=torch.bool)
+    labels, held = obj.part_ids.clone(), torch.zeros(len(obj.part_ids), dtype=torch.bool)
     sliding = [k for k, p in enumerate(obj.parts) if p.joint is not None and p.joint.type == "prismatic"]
     if not sliding:
-        return labels, none
+        return labels, held
     with drawing_with(backend):
         seen = sight(obj, cameras, RESOLUTION)
     body, near = seen.surface(0), NEAR * RESOLUTION * seen.voxel
-    trays, places = {}, {}
+    trays = {}
     for k in sliding:
         surface = seen.surface(k)
         tray = seen.tray(k, surface, body) if len(surface.faces) and len(body.faces) else None
         if tray is not None:
             trays[k] = tray
-            open_at = pose(obj, float(tray.drawn)).means.double()
-            places[k] = se3.apply(se3.inverse(seen.motions[k][tray.drawn]), open_at).numpy() @ tray.front.axes.T
-    deepest = {k: depth_within(places[k], tray).min(1) for k, tray in trays.items()}
-    reach, still = {}, (obj.part_ids == 0).numpy()
+    posed = {t: pose(obj, float(t)).means.double() for t in {tray.drawn for tray in trays.values()}}
+    deepest, reach, still = {}, {}, (obj.part_ids == 0).numpy()
     for k, tray in trays.items():
-        on = belongs(places[k], tray, near)
-        reach[k] = np.where(still, on & out_of_body(places[k], tray, near), on | beside(places[k], tray, near))
+        at = se3.apply(se3.inverse(seen.motions[k][tray.drawn]), posed[tray.drawn]).numpy() @ tray.front.axes.T
+        deepest[k] = tray.within(at).min(1)
+        on = belongs(at, tray, near)
+        reach[k] = np.where(still, on & out_of_body(at, tray, near), on | beside(at, tray, near))
+    for k in trays:
         mine = reach[k].copy()
         for j in trays:  # what is rather on another's
             mine &= (labels != j).numpy() | (deepest[j] <= deepest[k])
         labels[torch.from_numpy(mine)] = k
-    return labels, sum(((labels == k) & torch.from_numpy(r) for k, r in reach.items()), none)
+    for k in trays:
+        held |= (labels == k) & torch.from_numpy(reach[k])
+    return labels, held

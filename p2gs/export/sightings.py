@@ -114,6 +114,7 @@ def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolut
     """Look at the parts. obj and cameras ((state, camera) pairs) in one coordinate system. resolution: as in ``part_meshes``."""
     lo, hi = bounds(obj, (0.0,))
     size = float((hi - lo).max())
+    voxel = size / resolution
     index = torch.zeros(max(p.id for p in obj.parts) + 1, dtype=torch.int64)
     for k, part in enumerate(obj.parts):
         index[part.id] = k
@@ -122,8 +123,8 @@ def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolut
     limit = fog_limit(looks, size)
     views = []
     for seen, (_, camera) in zip(looks, cameras, strict=True):
-        view = add_normals(DepthView(camera, seen.depth, seen.label, seen.colour), edge=EDGE * size / resolution)
+        view = add_normals(DepthView(camera, seen.depth, seen.label, seen.colour), edge=EDGE * voxel)
         view.cosine = view.cosine * trust(seen, limit) * ~beside_others(seen.label)
         views.append(view)
     motions = [[start_motion(obj, k, 0.0), start_motion(obj, k, 1.0)] for k in range(len(obj.parts))]
-    return Sightings(size / resolution, views, motions, [[motion[state] for state, _ in cameras] for motion in motions])
+    return Sightings(voxel, views, motions, [[motion[state] for state, _ in cameras] for motion in motions])

@@ -170,6 +170,16 @@ class Tray:
     drawn: int
     shut: np.ndarray
 
+    def within(self, points: np.ndarray) -> np.ndarray:
+        """How far within each of its six sides points [N, 3], in the front's axes, are; negative outside, [N, 6]: first those at ``lo``."""
+        return np.concatenate([points - self.lo, self.hi - points], 1)
+
+    @property
+    def mouth_side(self) -> int:
+        """Which of the six sides is the mouth."""
+        axis, end = self.mouth
+        return 3 * end + 1 + axis
+
 
 def find_tray(mesh: Mesh, body: Mesh, slide: np.ndarray, eyes: Tensor, voxel: float) -> Optional[Tray]:
     """The tray of which ``mesh`` is what was seen; None where it is none, or was seen to its rear.
@@ -251,7 +261,7 @@ def not_the_trays(other: Mesh, tray: Tray, place: np.ndarray, voxel: float) -> M
     place [4, 4]: from the other part's start state to where, as seen from the drawer in its own, it is while the drawer is open.
     """
     middle = Faces(other.transformed(place), tray.front.axes).middle
-    return _without(other, ((middle > tray.lo - ON * voxel) & (middle < tray.hi + ON * voxel)).all(1))
+    return _without(other, (tray.within(middle) > -ON * voxel).all(1))
 
 
 def _without_strays(mesh: Mesh, tray: Tray, reach: float) -> Mesh:

@@ -227,7 +227,7 @@ def settle_labels(
     drawers; backend: draws the twin for it.
     """
     fuller = round(twin.canonical_time)  # the state that shows more
-    T = with_static(torch.stack([p.joint.transform for p in twin.parts[1:]])) if len(twin.parts) > 1 else torch.eye(4).double()[None]
+    T = torch.stack([torch.eye(4, dtype=torch.float64)] + [p.joint.transform for p in twin.parts[1:]])
     away, tau = se3.inverse(T) if fuller else T, config.polish.free_static or 0.02
 
     def without_islands(labels: Tensor, held: Tensor | None = None) -> Tensor:

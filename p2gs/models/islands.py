@@ -104,8 +104,9 @@ def settle_twin_islands(
 
     island = find_islands(points, old, share)
     if held is not None:
+        held = held[rows].float()
         for piece in island[island >= 0].unique():
-            if float(held[rows][island == piece].float().mean()) > 0.5:
+            if float(held[island == piece].mean()) > 0.5:
                 island[island == piece] = -1
     return _with_faint(g.means, labels, rows, _settle(points, old, island, fits=fits))
 
