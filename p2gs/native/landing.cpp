@@ -17,26 +17,26 @@ void check(const Travellers& from) {
 
 }  // namespace
 
-void landing_cost(const LandingTables& to, const MotionBatch& motions, bool back, const Travellers& from, float* cost, int64_t* met,
-                  int threads) {
+void landing_cost(const LandingTables& to, const MotionBatch& motions, const float* thick, bool back, const Travellers& from, float* cost,
+                  int64_t* met, int threads) {
     constexpr int64_t kPoints = 512, kMotions = 8;  // of a chunk
     check(from);
     const std::vector<float> matrices = motion_rows(motions, back);
     struct Context {
         decltype(LandingKernels::cost) kernel;
         const LandingTables& to;
-        const float* matrices;
+        const float *matrices, *thick;
         const Travellers& from;
         int64_t count, blocks;
         float* cost;
         int64_t* met;
-    } context{kernels().landing.cost, to, matrices.data(), from, motions.count, (from.count + kPoints - 1) / kPoints, cost, met};
+    } context{kernels().landing.cost, to, matrices.data(), thick, from, motions.count, (from.count + kPoints - 1) / kPoints, cost, met};
     parallel_for(
         int(context.blocks * ((motions.count + kMotions - 1) / kMotions)), threads,
         [](int chunk, int, void* p) {
             const Context& c = *static_cast<const Context*>(p);
             const int64_t begin = chunk % c.blocks * kPoints, first = chunk / c.blocks * kMotions;
-            c.kernel(c.to, c.matrices, first, std::min(first + kMotions, c.count), c.from, begin, std::min(begin + kPoints, c.from.count),
+            c.kernel(c.to, c.matrices, c.thick, first, std::min(first + kMotions, c.count), c.from, begin, std::min(begin + kPoints, c.from.count),
                      c.cost, c.met);
         },
         &context);

@@ -17,7 +17,7 @@ struct LandingTables {
     const float* claimed;     // [surfel], or null
     float lo[3];              // corner of both grids
     float h, hc;              // edges of their voxels, fine and coarse
-    float tp, spacing, hidden, on_static;
+    float tp, spacing, hidden, on_static, two_sided;
     int32_t fine[3], coarse[3];  // voxels by axis
 };
 
@@ -40,18 +40,18 @@ constexpr int kFitSums = 20;  // upper triangle of J^T W J [5, 5] by rows, then 
 
 struct LandingKernels {
     // Travellers [begin, end) under motions [first, last): cost [motion][traveller] and the surfel met, rows of from.count.
-    // matrices: [motion][12], rows of rotation and translation.
-    void (*cost)(const LandingTables&, const float* matrices, int64_t first, int64_t last, const Travellers& from, int64_t begin,
-                 int64_t end, float* cost, int64_t* met);
+    // matrices: [motion][12], rows of rotation and translation. thick: [motion] thickness of the plate that moves, 0: one side only.
+    void (*cost)(const LandingTables&, const float* matrices, const float* thick, int64_t first, int64_t last, const Travellers& from,
+                 int64_t begin, int64_t end, float* cost, int64_t* met);
     // Sums over all travellers under one motion. forward: as matrix, start -> end; basis: [6][5] twists by coordinate.
     void (*fit)(const LandingTables&, const float* matrix, const float* forward, const float* basis, const Travellers& from,
                 const PlaneFit& fit, float* sums);
 };
 
 // Both raise std::out_of_range for an index that is none of `from.size` rows.
-// cost [B, count] and met [B, count]; back: by the inverse motions. The same bits for any number of threads.
-void landing_cost(const LandingTables& to, const MotionBatch& motions, bool back, const Travellers& from, float* cost, int64_t* met,
-                  int threads);
+// cost [B, count] and met [B, count]; back: by the inverse motions; thick [B]. The same bits for any number of threads.
+void landing_cost(const LandingTables& to, const MotionBatch& motions, const float* thick, bool back, const Travellers& from, float* cost,
+                  int64_t* met, int threads);
 
 // Adds J^T W J to A [B, 5, 5] and J^T W r to b [B, 5]; basis: [B, 6, 5].
 void landing_fit(const LandingTables& to, const MotionBatch& motions, const float* basis, const Travellers& from, const PlaneFit& fit,

@@ -19,6 +19,7 @@ class DiscoveryConfig:
     min_angle, max_angle: degrees searched.  max_slide: times the box diagonal.
     attach: weight of the rule that a hinge touches the part it carries.
     slide_bonus: a slide has two degrees of freedom less than a turn: share of a part's gain in its favour.
+    thickest: greatest thickness of a plate of which the states may show different sides, times the box diagonal.
     split: least share of its residual that half a part must lose with an amount of its own.
     min_mass: least share of the moved surface of a part.  min_moved: fewest moved surfels a state below which nothing moved.
     search_weight: weight of the search's own value beside the image-space violation when explanations are ranked.
@@ -38,6 +39,7 @@ class DiscoveryConfig:
     max_slide: float = 0.42
     attach: float = 0.8
     slide_bonus: float = 0.1
+    thickest: float = 0.04
     split: float = 0.3
     min_mass: float = 0.015
     min_moved: int = 12

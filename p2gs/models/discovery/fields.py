@@ -46,11 +46,13 @@ class Landing:
     """Cost in 0..1 of a surfel arriving somewhere in one state.
 
     Arriving on a like surface costs nothing, inside space the state's cameras never saw 0.35, deep in space they saw to be
-    empty 1, on a surface that never moved 0.2 more.
+    empty 1, on a surface that never moved 0.2 more.  A plate of known thickness may show its other side: arriving that far behind a
+    surface that faces the other way costs 0.1, half of what colours that disagree cost, as the sides' colours tell nothing.
     """
 
     HIDDEN = 0.35
     ON_STATIC = 0.20
+    TWO_SIDED = 0.10
 
     def __init__(self, surfels: Surfels, static: Tensor, stack: DepthStack, lo: Tensor, hi: Tensor, scale: Scale, cells: float = 3e5):
         self.surfels, self.static, self.scale = surfels, static, scale
@@ -100,13 +102,27 @@ class Landing:
         voxels = int(self.coarse.prod())
         return self.nearest[normal_code(n).long() * voxels + self._index(x, self.coarse, self.hc)].long()
 
-    def open(self, x: Tensor) -> Tensor:
-        """Cost of arriving where no surface is: ``HIDDEN`` in unseen space, rising to 1 within a voxel or two of seen-free space."""
+    def free(self, x: Tensor) -> Tensor:
+        """How deep in seen-free space: 0 at its border to 1 within a voxel or two."""
         depth = self.depth_free[self._index(x, self.size, self.h)]
-        return self.HIDDEN + (1 - self.HIDDEN) * ((depth - 0.5 * self.h) / (2 * self.h)).clamp(0, 1)
+        return ((depth - 0.5 * self.h) / (2 * self.h)).clamp(0, 1)
 
-    def cost(self, x: Tensor, n: Tensor, c: Tensor | None = None, claimed: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Cost [...] and matched surfel [...]. claimed [M] in 0..1: surfels that another part explains already cost like static ones."""
+    def cost(
+        self, x: Tensor, n: Tensor, c: Tensor | None = None, claimed: Tensor | None = None, thick: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Cost [...] and matched surfel [...]. claimed [M] in 0..1: surfels that another part explains already cost like static ones.
+        thick [...]: of the plate that arrives; where above 0 its other side may be what is met."""
+        cost, j = self.matching(x, n, c, claimed)
+        free = self.free(x)
+        if thick is not None:
+            other, behind = self.matching(x - thick[..., None] * n, -n, None, claimed)
+            other = torch.where(thick > 0, torch.maximum(free, self.TWO_SIDED + other), torch.inf)
+            j = torch.where(other < cost, behind, j)
+            cost = torch.minimum(cost, other)
+        return torch.minimum(cost, self.HIDDEN + (1 - self.HIDDEN) * free).clamp_max(1), j
+
+    def matching(self, x: Tensor, n: Tensor, c: Tensor | None, claimed: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Cost [...] of taking the surfel met for one's own place, and that surfel [...]; c: None where colours are another side's."""
         s, k = self.surfels, self.scale
         j = self.match(x, n)
         d = x - s.points[j]
@@ -119,8 +135,7 @@ class Landing:
         if c is not None:
             cost = cost + 0.2 * (((s.colours[j] - c).abs().mean(-1) - 0.1) / 0.5).clamp(0, 1)
         taken = self.static[j].float() if claimed is None else torch.maximum(self.static[j].float(), claimed[j])
-        cost = cost + self.ON_STATIC * taken
-        return torch.minimum(cost, self.open(x)).clamp_max(1), j
+        return cost + self.ON_STATIC * taken, j
 
     def arrive(
         self, motions: Motions, source: "Landing", index: Tensor, back: bool = False, claimed: Tensor | None = None
@@ -129,15 +144,16 @@ class Landing:
         ``back``, by their inverses.  One pass of a kernel where there is one, else ``cost``, which it equals up to rounding."""
         if not self.fused:
             s = source.surfels
-            return self.cost(motions.apply(s.points[index], back), motions.rotate(s.normals[index], back), s.colours[index], claimed)
+            x, n = motions.apply(s.points[index], back), motions.rotate(s.normals[index], back)
+            return self.cost(x, n, s.colours[index], claimed, motions.thick[:, None].expand(x.shape[:-1]))
         index = index.contiguous()
         cost = torch.empty(len(motions), len(index))
         met = torch.empty(len(motions), len(index), dtype=torch.long)
         claimed = None if claimed is None else claimed.float().contiguous()
         if cost.numel():
-            moving = motions.packed()
+            moving, thick = motions.packed(), motions.thick.float().contiguous()
             native.landing_cost(
-                *self.tables(), 0 if claimed is None else claimed.data_ptr(), [m.data_ptr() for m in moving], len(motions), back,
+                *self.tables(), 0 if claimed is None else claimed.data_ptr(), [m.data_ptr() for m in moving], thick.data_ptr(), len(motions), back,
                 source.rows.data_ptr(), len(source.rows), index.data_ptr(), len(index), cost.data_ptr(), met.data_ptr(), num_threads(),
             )  # fmt: skip
         return cost, met
@@ -152,6 +168,6 @@ class Landing:
         k = self.scale
         return (
             [self.nearest.data_ptr(), self.depth_free.data_ptr(), self.rows.data_ptr()],
-            [*self.lo.tolist(), self.h, self.hc, k.tp, k.spacing, self.HIDDEN, self.ON_STATIC],
+            [*self.lo.tolist(), self.h, self.hc, k.tp, k.spacing, self.HIDDEN, self.ON_STATIC, self.TWO_SIDED],
             [*self.size.tolist(), *self.coarse.tolist()],
         )

@@ -44,7 +44,7 @@ def snapped(problem: Problem, motion: Motions, middle: Tensor, axes: Tensor, wit
     n = int(near.sum())
     a = motion.axis[0]
     centre = motion.centre[0] + a * ((middle - motion.centre[0]) @ a)
-    return Motions(motion.turn.expand(n), axes[near] * c[near].sign()[:, None], centre.expand(n, 3), motion.amount.expand(n))
+    return Motions(motion.turn.expand(n), axes[near] * c[near].sign()[:, None], centre.expand(n, 3), motion.amount.expand(n), motion.thick.expand(n))
 
 
 def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, axes: Tensor, n: int = 900) -> Motions:
@@ -99,7 +99,7 @@ def split_amounts(
     tp = problem.scale.tp
     arm = 0.2 * problem.scale.diag if bool(m.turn) else 1.0
     delta = torch.linspace(-4, 4, steps) * tp / arm
-    many = Motions(m.turn.expand(steps), m.axis.expand(steps, 3), m.centre.expand(steps, 3), m.amount + delta)
+    many = Motions(m.turn.expand(steps), m.axis.expand(steps, 3), m.centre.expand(steps, 3), m.amount + delta, m.thick.expand(steps))
     none = (0.0, float(m.amount), float(m.amount))
     costs = []
     for s in (0, 1):
@@ -135,8 +135,8 @@ def with_amounts(motions: Motions, k: int, a: float, b: float) -> Motions:
     """Part k takes amount a, a new last part the same axis and amount b."""
     amount = motions.amount.clone()
     amount[k] = a
-    new = Motions(motions.turn[k : k + 1], motions.axis[k : k + 1], motions.centre[k : k + 1], torch.tensor([b]))
-    return Motions.cat([Motions(motions.turn, motions.axis, motions.centre, amount), new])
+    new = Motions(motions.turn[k : k + 1], motions.axis[k : k + 1], motions.centre[k : k + 1], torch.tensor([b]), motions.thick[k : k + 1])
+    return Motions.cat([Motions(motions.turn, motions.axis, motions.centre, amount, motions.thick), new])
 
 
 def settle_parts(problem: Problem, graphs: list[Graph], motions: Motions, axes: Tensor, rounds: int = 2) -> tuple[Motions, Labelling]:

@@ -13,6 +13,10 @@ from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.rigid import Motions, perpendicular
 
 
+PLATE = 0.5  # thickness of plates in the sweep, coarse voxels: surfaces within three quarters of one count as met
+OTHER_SIDE = 0.8  # evidence of a plate's other side beside that of the same surface: its colours confirm nothing
+
+
 def half_sphere(n: int = 400) -> Tensor:
     """[n, 3] Fibonacci directions with z >= 0."""
     i = torch.arange(n) + 0.5
@@ -168,16 +172,14 @@ def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120
             for sign in (1.0, -1.0):
                 m = Motions(torch.ones(C, dtype=torch.bool), d.expand(C, 3), centre, torch.full((C,), sign * angle))
                 R = m[:1].matrices()[0][0]
-                forward = (centre - lo) / hc @ (torch.eye(3) - R).T
-                backward = (centre - lo) / hc @ (torch.eye(3) - R.T).T
-                q = torch.cat(
-                    [
-                        look(points[0] @ R.T, normals[0] @ R.T, forward, tables[1]),
-                        look(points[1] @ R, normals[1] @ R, backward, tables[0]),
-                    ],
-                    1,
-                )
-                keep_good(m, q)
+                shifts = [(centre - lo) / hc @ (torch.eye(3) - turn).T for turn in (R, R.T)]
+                q = []
+                for s, turn in enumerate((R, R.T)):  # a plate may arrive with either side to the cameras: what turns shows other sides
+                    p, facing = points[s] @ turn.T, normals[s] @ turn.T
+                    same = look(p, facing, shifts[s], tables[1 - s])
+                    other = look(p - PLATE * facing, -facing, shifts[s], tables[1 - s])
+                    q.append(torch.maximum(same, (other.float() * OTHER_SIDE).to(torch.uint8)))
+                keep_good(m, torch.cat(q, 1))
     motions = Motions.cat([m for m, _ in kept])
     evidence = torch.cat([q for _, q in kept])
     if len(motions) > keep:

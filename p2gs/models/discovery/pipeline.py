@@ -21,7 +21,7 @@ from p2gs.models.discovery.pool import plausibility
 from p2gs.models.discovery.problem import Problem, build_problem, resampled
 from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
 from p2gs.models.discovery.rigid import Motions
-from p2gs.models.discovery.search import Search
+from p2gs.models.discovery.search import ExclusiveGain, Search, two_sided
 from p2gs.models.discovery.verify import image_score, violation
 from p2gs.ops import se3
 from p2gs.types import UserError
@@ -107,7 +107,7 @@ def discover(
 
 def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate:
     """The explanation by other motions: transforms [K, 4, 4] start -> end, types "revolute" | "prismatic". Every surfel chooses anew."""
-    motions = as_motions(transforms, types)
+    motions = sided(found.problem, as_motions(transforms, types))
     labelling = label(found.problem, motions, found.graphs, revealed=True)
     return Candidate(found_motions(found.problem, motions, labelling), found.problem.surfels, labelling.probability, 0.0, 0.0)
 
@@ -121,7 +121,7 @@ def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int
     search = found.search
     if search is None:
         return []
-    own = as_motions(transforms, types)
+    own = sided(found.problem, as_motions(transforms, types))
     rest = search.pool.add(own[torch.tensor([k for k in range(len(types)) if k != part], dtype=torch.long)]).tolist()
     motions, _ = search.propose(rest, 96, 12, each=True)
     if not len(motions):
@@ -132,6 +132,11 @@ def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int
     far = (known.swept(search.probe, motions) > search.radius).all(0)
     picked = [i for turn in (True, False) for i in [i for i in best if far[i] and bool(motions.turn[i]) == turn][:count]]
     return [(motions.transform(i), "revolute" if bool(motions.turn[i]) else "prismatic") for i in picked]
+
+
+def sided(problem: Problem, motions: Motions) -> Motions:
+    """The motions with the thickness of plate under which most of the moved surface arrives."""
+    return two_sided(problem, motions, ExclusiveGain(problem, problem.samples, [torch.ones(len(s)) for s in problem.samples]))
 
 
 def as_motions(transforms: Tensor, types: list[str]) -> Motions:

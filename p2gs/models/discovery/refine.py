@@ -104,6 +104,7 @@ def pattern_search(
             torch.where(better[:, None], pick.axis, motions.axis),
             torch.where(better[:, None], pick.centre, motions.centre),
             torch.where(better, pick.amount, motions.amount),
+            motions.thick,
         )
         value = torch.where(better, best, value)
         scale = torch.where(better, scale, scale * 0.5)

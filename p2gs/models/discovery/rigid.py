@@ -29,22 +29,28 @@ def perpendicular(axis: Tensor) -> tuple[Tensor, Tensor]:
 @dataclass
 class Motions:
     """B motions start -> end. turn [B] bool (revolute); axis [B, 3] unit; centre [B, 3] a point on the axis (unused by slides);
-    amount [B]: radians or scene units, signed along the axis."""
+    amount [B]: radians or scene units, signed along the axis.  thick [B]: thickness (scene units) of the plate that moves, of which one
+    state may show one side and the other state the other; 0 (the default): sides are told apart by nothing but themselves."""
 
     turn: Tensor
     axis: Tensor
     centre: Tensor
     amount: Tensor
+    thick: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if self.thick is None:
+            self.thick = torch.zeros(len(self.amount))
 
     def __len__(self) -> int:
         return len(self.amount)
 
     def __getitem__(self, index) -> "Motions":
-        return Motions(self.turn[index], self.axis[index], self.centre[index], self.amount[index])
+        return Motions(self.turn[index], self.axis[index], self.centre[index], self.amount[index], self.thick[index])
 
     @staticmethod
     def cat(items: list["Motions"]) -> "Motions":
-        return Motions(*(torch.cat([getattr(m, n) for m in items]) for n in ("turn", "axis", "centre", "amount")))
+        return Motions(*(torch.cat([getattr(m, n) for m in items]) for n in ("turn", "axis", "centre", "amount", "thick")))
 
     @staticmethod
     def empty() -> "Motions":
@@ -100,7 +106,7 @@ class Motions:
         if native is None or self.amount.dtype != torch.float32:
             return self.displaced_reference(step)
         moving, step = self.packed(), step.float().contiguous()
-        out = Motions(self.turn, torch.empty(len(self), 3), torch.empty(len(self), 3), torch.empty(len(self)))
+        out = Motions(self.turn, torch.empty(len(self), 3), torch.empty(len(self), 3), torch.empty(len(self)), self.thick)
         native.motion_displaced(
             [m.data_ptr() for m in moving], len(self), step.data_ptr(), out.axis.data_ptr(), out.centre.data_ptr(), out.amount.data_ptr()
         )
@@ -123,6 +129,7 @@ class Motions:
             torch.where(turn, axis_turn, axis_slide),
             torch.where(turn, self.centre + step[:, 3:4] * e1 + step[:, 4:5] * e2, self.centre),
             torch.where(self.turn, self.amount + step[:, 0], length * sign),
+            self.thick,
         )
 
     def twist_basis(self) -> Tensor:

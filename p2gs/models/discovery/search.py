@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
+from typing import Callable
 
 import torch
 from torch import Tensor
@@ -18,6 +20,22 @@ from p2gs.models.discovery.pool import Pool, plausibility
 from p2gs.models.discovery.problem import Problem, balanced
 from p2gs.models.discovery.refine import gauss_newton, pattern_search
 from p2gs.models.discovery.rigid import Motions
+
+THICKNESSES = 8  # of plates that are tried
+
+
+def two_sided(problem: Problem, motions: Motions, gain: Callable[[Motions], Tensor]) -> Motions:
+    """The motions with the thickness of plate under which ``gain`` [B] is greatest; slides show the same sides in both states and keep 0."""
+    turns = motions.turn.nonzero()[:, 0]
+    if not len(turns):
+        return motions
+    tried = [motions[turns]]
+    for thick in torch.arange(1, THICKNESSES + 1) * problem.config.thickest * problem.scale.diag / THICKNESSES:
+        tried.append(replace(tried[0], thick=thick.expand(len(turns)).clone()))
+    best = torch.stack([gain(m) for m in tried]).argmax(0)
+    thick = torch.zeros(len(motions))
+    thick[turns] = torch.stack([m.thick for m in tried]).gather(0, best[None])[0]
+    return replace(motions, thick=thick)
 
 
 class ExclusiveGain:
@@ -69,6 +87,7 @@ class Search:
         if len(motions) == 0:
             return motions, torch.zeros(0)
         gain = ExclusiveGain(self.problem, self.samples, left)
+        motions = two_sided(self.problem, motions, gain)
         sharp = gauss_newton(self.problem, motions, self.samples, [w * x for w, x in zip(self.problem.weights, left, strict=False)])
         both = Motions.cat([motions, sharp])
         value = gain(both)

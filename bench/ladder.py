@@ -1,0 +1,140 @@
+"""The oracle ladder of part discovery: which step loses which joint? A bench tool that reads ground truth, which no phase may.
+
+    python bench/ladder.py RUN... [--truth] [--out FILE]
+
+RUN holds the single states of a scene (``p2gs fit ... --only single_state``). Discovery is run from them, anew, and its joints are held against the
+true ones: found (right type, axis <= 1 deg, position x10 <= 0.15, motion <= 1 deg or 0.01, or a listed tie), and what each step had.
+``--truth`` also hands in the true motions: their energy beside that of what was found, and how far refinement carries them away.
+A line of JSON per run goes to FILE.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+
+from p2gs.config import load_config
+from p2gs.data.ground_truth import load_ground_truth
+from p2gs.metrics.joints import evaluate_joints
+from p2gs.models import handover
+from p2gs.models.part_motions import find_part_motions
+from p2gs.ops import se3
+from p2gs.pipeline import Pipeline
+
+RIGHT = {"axis_angle": 1.0, "axis_position": 0.15, "turn": 1.0, "slide": 0.01}  # the field's bounds of a right joint
+
+
+def to_internal(T: torch.Tensor, similarity) -> torch.Tensor:
+    """A motion [4, 4] of the input's world in training units."""
+    c = torch.as_tensor(similarity.center, dtype=torch.float64)
+    return se3.make(T[:3, :3], similarity.scale * (T[:3, 3] + T[:3, :3] @ c - c))
+
+
+def to_input(T: torch.Tensor, similarity) -> torch.Tensor:
+    """The reverse of ``to_internal``."""
+    c = torch.as_tensor(similarity.center, dtype=torch.float64)
+    return se3.make(T[:3, :3], T[:3, 3] / similarity.scale + c - T[:3, :3] @ c)
+
+
+def joint_of(T: torch.Tensor, kind: str) -> SimpleNamespace:
+    """A transform [4, 4] as the joint that ``evaluate_joints`` reads."""
+    if kind == "prismatic":
+        length = T[:3, 3].norm()
+        return SimpleNamespace(type=kind, axis=T[:3, 3] / length.clamp_min(1e-9), origin=torch.zeros(3).double(), motion=float(length))
+    screw = se3.screw_parameters(T)
+    return SimpleNamespace(type=kind, axis=screw.axis, origin=screw.origin, motion=math.degrees(float(screw.angle)))
+
+
+def ties_of(name: str, zoo: Path) -> dict[str, list[float]]:
+    """Other turns (degrees) that explain a scene's joints as well, by joint's index in its scenes.tsv line."""
+    lines = [line.split("\t") for line in (zoo / "ties.tsv").read_text().splitlines()] if (zoo / "ties.tsv").exists() else []
+    return {joint: [float(x) for x in other.split(",")] for scene, joint, _, other in lines if scene == name}
+
+
+def is_right(score, gt, pred, others: list[float]) -> bool:
+    """Within ``RIGHT`` of the true joint, or of one with another turn that no picture tells from it."""
+    from p2gs.metrics.joints import joint_errors
+
+    if score.failed:
+        return False
+    for motion in [gt.motion, *others]:
+        e = joint_errors(pred, SimpleNamespace(type=gt.type, axis=gt.axis, origin=gt.origin, motion=motion))
+        bound = RIGHT["turn"] if gt.type == "revolute" else RIGHT["slide"]
+        if e.axis_angle <= RIGHT["axis_angle"] and (e.axis_position or 0) <= RIGHT["axis_position"] and e.motion <= bound:
+            return True
+    return False
+
+
+class Case:
+    """A run, its states and its truth."""
+
+    def __init__(self, run: Path, zoo: Path):
+        self.name = run.name
+        self.pipeline = Pipeline(load_config([str(run / "config.yaml")]))
+        self.states = [handover.load(run / "checkpoints" / f"single_state_{s}.pt")[0] for s in (0, 1)]
+        self.scene, self.cfg = self.pipeline.scene, self.pipeline.cfg
+        self.truth = load_ground_truth(self.cfg.data.root)
+        names = next((row.split("\t")[3] for row in (zoo / "scenes.tsv").read_text().splitlines() if row.split("\t")[2] == self.name), "")
+        self.joints = [part.split("=")[0] for part in names.split(",")] if names else []
+        self.ties = ties_of(self.name, zoo)
+
+    @property
+    def similarity(self):
+        return self.scene.similarity
+
+    def true_motions(self) -> tuple[torch.Tensor, list[str]]:
+        """[K, 4, 4] in training units, and the types."""
+        joints = self.truth.joints
+        return torch.stack([to_internal(j.transform.double(), self.similarity) for j in joints]), [j.type for j in joints]
+
+    def score(self, transforms: torch.Tensor, types: list[str]) -> dict:
+        """Each true joint's errors and whether it is right; how many parts are too many."""
+        found = [joint_of(to_input(T.double(), self.similarity), kind) for T, kind in zip(transforms, types, strict=True)]
+        report = evaluate_joints(found, self.truth.joints)
+        rows = []
+        for s in report.joints:
+            others = self.ties.get(self.joints[s.gt], []) if self.joints else []
+            right = is_right(s, self.truth.joints[s.gt], found[s.pred] if s.pred is not None else None, others)
+            e = s.errors
+            errors = None if e is None else [round(e.axis_angle, 3), None if e.axis_position is None else round(e.axis_position, 3), round(e.motion, 4)]
+            rows.append({"joint": s.gt, "type": s.type, "pred": s.pred, "right": right, "errors": errors})
+        return {"right": sum(r["right"] for r in rows), "of": len(rows), "extra": len(report.extra), "joints": rows}
+
+    def discover(self, report=None):
+        """Discovery as a run does it. Returns PartMotions and seconds."""
+        clock = time.perf_counter()
+        motions = find_part_motions(
+            self.states, self.scene, self.pipeline.views, self.cfg.num_parts, self.cfg.phases["discovery"].config, seed=self.cfg.seed,
+            backend=self.cfg.rasterizer, device=self.pipeline.device, report=report,
+        )  # fmt: skip
+        return motions, time.perf_counter() - clock
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--zoo", type=Path, default=Path("../shared/zoo"))
+    parser.add_argument("--truth", action="store_true")
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    for run in args.runs:
+        case = Case(run, args.zoo)
+        motions, seconds = case.discover()
+        row = {"name": case.name, "seconds": round(seconds, 1), **case.score(motions.transforms, motions.types)}
+        row["found"] = [[t, round(float(c), 3)] for t, c in zip(motions.types, motions.confidence, strict=True)]
+        print(f"{row['name']}: {row['right']} of {row['of']} right, {row['extra']} too many, {row['seconds']} s", row["joints"], row["found"], flush=True)
+        if args.out:
+            with args.out.open("a") as f:
+                f.write(json.dumps(row) + "\n")
+
+
+if __name__ == "__main__":
+    main()
