@@ -18,6 +18,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import torch
+import yaml
 
 from p2gs.config import load_config
 from p2gs.data.ground_truth import load_ground_truth
@@ -74,9 +75,10 @@ def is_right(score, gt, pred, others: list[float]) -> bool:
 class Case:
     """A run, its states and its truth."""
 
-    def __init__(self, run: Path, zoo: Path):
+    def __init__(self, run: Path, zoo: Path, preset: str = "configs/preset/cpu.yaml"):
         self.name = run.name
-        self.pipeline = Pipeline(load_config([str(run / "config.yaml")]))
+        told = yaml.safe_load((run / "config.yaml").read_text())  # only where the scene is: this build's own defaults are what is measured
+        self.pipeline = Pipeline(load_config([preset], ["--data.root", told["data"]["root"], "--data.depth", "never", "--run", str(run)]))
         self.states = [handover.load(run / "checkpoints" / f"single_state_{s}.pt")[0] for s in (0, 1)]
         self.scene, self.cfg = self.pipeline.scene, self.pipeline.cfg
         self.truth = load_ground_truth(self.cfg.data.root)

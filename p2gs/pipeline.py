@@ -24,6 +24,7 @@ from p2gs.models.articulation import ArticulationPhase
 from p2gs.models.canonical_fusion import CanonicalFusionPhase
 from p2gs.models.diagnosis import StageResults
 from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.discovery.problem import Problem, build_problem
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.finish import finish
 from p2gs.models.openings import open_up
@@ -248,6 +249,15 @@ class Pipeline:
         options = {"stacks": stacks, "counted": counted, **self.common()}
         return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, **options)
 
+    def surfaces(self, states) -> Problem:
+        """The surfaces of both states as discovery sees them."""
+        found, evidence = self.cfg.phases["discovery"].config, []
+        for s in states:
+            views = self.scene.select(state=s.state, split="train")
+            size, options = (found.evidence_size, found.min_opacity), {"backend": self.cfg.rasterizer, "device": self.device}
+            evidence.append(gather_evidence(s.gaussians, views, *size, **options))
+        return build_problem(*evidence, found.search, self.cfg.seed)[0]
+
     def articulate(self, canonical, states, motions, section) -> Phase:
         extent = float((self.scene.box[1] - self.scene.box[0]).norm())
         parts = len(motions) + 1 if motions is not None else self.cfg.num_parts
@@ -321,6 +331,7 @@ class Pipeline:
             backend=self.backend,
             twin_backend=self.cfg.rasterizer,
             contents=in_trays,
+            problem=self.surfaces(found_in),
             device=device,
         )
         for note in notes:

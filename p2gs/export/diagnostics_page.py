@@ -137,9 +137,9 @@ def _discovery(d: dict) -> list[str]:
             gone = ", ".join(f"{r['change']} {r['type']} ({r['cost_with']:.4f} to {r['cost_without']:.4f})" for r in tried)
             ended = [c for c in contests if c["explanation"] == i and len(contests) > 1]
             mark = "chosen" if i == found["chosen"] else "reconsidered" if ended else ""
-            rows.append([str(i + 1), f"{e['cost']:.4f}", mark, f"{', '.join(e.get('types', []))}{'; ' * bool(gone)}{gone}"])
-            rows += [["", f"{c['rank']:.4f}", "where that led, with a price on each part", ", ".join(c["types"])] for c in ended]
-        out.append(table(["explanation", "image loss", "", "parts; what was dropped or merged (image loss with it, without it)"], rows))
+            rows.append([str(i + 1), f"{e['cost']:.4f}", f"{e['rank']:.3f}", mark, f"{', '.join(e.get('types', []))}{'; ' * bool(gone)}{gone}"])
+            rows += [["", "", f"{c['rank']:.3f}", "where that led", ", ".join(c["types"])] for c in ended]
+        out.append(table(["explanation", "image loss", "energy", "", "parts; what was dropped or merged (image loss with it, without it)"], rows))
         rows = [[f"{p['part']}", p["type"], _amount(p), f"{p['confidence']:.2f}"] for p in found["parts"]]
         out.append(table(["part of discovery", "type", "start to end", "share explained"], rows))
     rows = [

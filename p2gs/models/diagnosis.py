@@ -167,7 +167,7 @@ def discovery(motions: PartMotions, unit: float) -> dict:
     told = motions.diagnostics
     return {
         "chosen": told.get("explanation"),
-        "explanations": told.get("explanations") or [{"cost": c} for c in told.get("photometric_costs", [])],
+        "explanations": told.get("explanations", []),
         "contests": told.get("contests", []),
         "candidates": told.get("candidates", []),
         "parts": [

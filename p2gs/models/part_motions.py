@@ -5,14 +5,15 @@ Not a training phase of the paper: its ancestors need hand-made part centres or 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
-from p2gs.models.discovery import DiscoveryConfig, discover
-from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.discovery import Discovery, DiscoveryConfig, discover, relabel, surface_energy
+from p2gs.models.discovery.pipeline import SurfaceStacks
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.part_choices import settle_types, simplify
@@ -21,6 +22,7 @@ from p2gs.models.refine_motions import explanation_cost, leave_false_minima, ref
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.models.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
 from p2gs.ops import se3
+from p2gs.parts.bodies import Surfaces, one_part_a_body
 from p2gs.types import TwoStateScene, UserError
 
 
@@ -31,9 +33,7 @@ class PartMotionsConfig:
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
     candidates: how many complete explanations are compared by re-rendering; of more, those that look best after ``look_steps`` of
     refinement at the smallest size.  contenders: how many of these go on through all that follows, up to ``reconsider``, where they differ
-    and their image loss is within the share ``contend`` of the best: a wrong start may lead nowhere, and a worse one to the truth. It
-    must then win by ``contend_win``: by less, junk wins too.  tie: image losses within this share do not tell which comes first; what the
-    search made of the surfaces does (a dark flap is its own mirror image to the photographs).
+    and their energy is within ``contend`` of the best: a wrong start may lead nowhere, and a worse one to the truth.
     coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
     freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: the same for a further part.
@@ -56,8 +56,6 @@ class PartMotionsConfig:
     candidates: int = 3
     contenders: int = 2
     contend: float = 0.1
-    contend_win: float = 0.05
-    tie: float = 0.02
     look_steps: int = 40
     compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
@@ -114,9 +112,9 @@ def find_part_motions(
         if len(seen.points) < 10 or not any(bool((d > 0).any()) for d in seen.depths):
             name = ("start", "end")[s.state]
             raise UserError(f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)")
-    stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in evidence]
     say("looking for parts")
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
+    stacks = SurfaceStacks(found.problem)
     explanations, looks = _explanations(found), []
     if len(explanations) > config.candidates:
         say(f"a quick look at {len(explanations)} explanations")
@@ -124,12 +122,12 @@ def find_part_motions(
 
         def first_look(explanation) -> float:
             motions = refine(states, _label_states(explanation, states), views, quick, stacks, **options)
-            return _rank(explanation_cost(states, motions, views, quick.levels[0], backend, device), motions, config)
+            return energy(found, states, motions, views, quick.levels[0], backend, device)
 
         looks = [first_look(e) for e in explanations]
         order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
         explanations = [explanations[i] for i in order]
-    refined, costs, tried, level = [], [], [], config.coarse.levels[-1]
+    refined, tried, level = [], [], config.coarse.levels[-1]
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
@@ -137,26 +135,29 @@ def find_part_motions(
         motions = refine(states, motions, views, config.coarse, stacks, **options)
         reductions: list[dict] = []
         motions = simplify(states, motions, views, config, backend=backend, device=device, log=reductions)
+        rank = energy(found, states, motions, views, level, backend, device)
         cost = explanation_cost(states, motions, views, level, backend, device)
-        costs.append(cost)
-        rank = _rank(cost, motions, config)
         tried.append({"types": motions.types, "cost": cost, "rank": rank, "value": explanation.value, "reductions": reductions})
         refined.append((rank, number, motions))
-    contenders = _contenders(refined, [t["value"] for t in tried], config)
+    contenders = _contenders(refined, config)
     limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
     ends, contests = [], []
     for _, number, motions in contenders:
         motions = settle_types(states, motions, views, config, stacks, **options)
-        changed: list[dict] = []
+        motions, bodies = one_part_a_body(states, motions, labelled_surfaces(found, motions.transforms, motions.types), limit)
+        if bodies:
+            motions = refine(states, motions, views, config.coarse, stacks, **options)
+        changed: list[dict] = [{"change": "one part a body", **b} for b in bodies]
         motions, shifted = leave_false_minima(states, motions, views, config.coarse, stacks, config.survey, **options)
         if config.reconsider:
             say("reconsidering each part" + (f" of explanation {number + 1}" if len(contenders) > 1 else ""))
-            motions, changed = reconsider(found, states, motions, views, config, stacks, limit, **options)
+            motions, reconsidered = reconsider(found, states, motions, views, config, stacks, limit, **options)
+            changed += reconsidered
             motions = simplify(states, motions, views, config, backend=backend, device=device, log=changed)
-        rank = _rank(explanation_cost(states, motions, views, level, backend, device), motions, config)
+        rank = energy(found, states, motions, views, level, backend, device)
         contests.append({"explanation": number, "types": motions.types, "rank": rank})
         ends.append((number, motions, shifted, changed))
-    number, motions, shifted, changed = ends[_winner([c["rank"] for c in contests], config.contend_win)]
+    number, motions, shifted, changed = ends[min(range(len(ends)), key=lambda i: contests[i]["rank"])]
     say("settling labels and motions")
     motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
     motions, unfounded = drop_unfounded(found, states, motions, views, config, stacks, **options)
@@ -165,7 +166,6 @@ def find_part_motions(
     motions.diagnostics = {
         "explanation": number,
         "contests": contests,
-        "photometric_costs": costs,
         "first_looks": looks,
         "explanations": tried,
         "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],  # of the Gaussians above min_opacity
@@ -179,30 +179,28 @@ def find_part_motions(
     return motions
 
 
-def _rank(cost: float, motions: PartMotions, config: PartMotionsConfig) -> float:
-    """Image loss with a price on every part: lower is better."""
-    return cost * (1 + config.part_penalty) ** len(motions)
+def labelled_surfaces(found: Discovery, transforms: Tensor, types: list[str]) -> Surfaces:
+    """Both states' surfels, each with the part that it chooses amid motions ``transforms`` [K, 4, 4] of ``types``."""
+    explanation, problem = relabel(found, transforms, types), found.problem
+    points, labels = [s.points for s in problem.surfels], [p.argmax(1) for p in explanation.probability]
+    return Surfaces(points, labels, problem.scale.spacing, problem.stacks, problem.scale.tau)
 
 
-def _contenders(
-    refined: list[tuple[float, int, PartMotions]], values: list[float], config: PartMotionsConfig
-) -> list[tuple[float, int, PartMotions]]:
-    """Of (rank, number, motions), the best first and those that are nearly as good and say something else; where the photographs hardly
-    tell which is best, the surfaces do. values: what discovery's search made of each, by number; more is better."""
+def energy(found, states, motions: PartMotions, views, level: int, backend: str, device="cpu") -> float:
+    """One number by which explanations are compared, lower is better: the logarithm of the image loss (both ways) plus what the surfaces say
+    (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained."""
+    loss = explanation_cost(states, motions, views, level, backend, device)
+    return math.log(max(loss, 1e-9)) + surface_energy(found, motions.transforms, motions.types)
+
+
+def _contenders(refined: list[tuple[float, int, PartMotions]], config: PartMotionsConfig) -> list[tuple[float, int, PartMotions]]:
+    """Of (energy, number, motions), the best first and those that are nearly as good and say something else."""
     ordered, out = sorted(refined, key=lambda t: t[:2]), []
-    tied = [t for t in ordered if t[0] <= ordered[0][0] * (1 + config.tie)]
-    first = max(tied, key=lambda t: values[t[1]])
-    for rank, number, motions in [first, *(t for t in ordered if t is not first)]:
-        close = rank <= ordered[0][0] * (1 + config.contend)
+    for rank, number, motions in ordered:
+        close = rank <= ordered[0][0] + config.contend
         if not out or (close and not any(_same(motions, other, config.same_motion) for _, _, other in out)):
             out.append((rank, number, motions))
     return out[: max(config.contenders, 1)]
-
-
-def _winner(ranks: list[float], margin: float) -> int:
-    """The lowest of ``ranks``, if it is lower than the first by more than the share ``margin``; else the first."""
-    best = min(range(len(ranks)), key=ranks.__getitem__)
-    return best if ranks[best] < ranks[0] * (1 - margin) else 0
 
 
 def _same(a: PartMotions, b: PartMotions, reach: float) -> bool:

@@ -8,10 +8,13 @@ import torch
 from torch import Tensor
 
 from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.discovery.pipeline import SurfaceStacks
 from p2gs.models.free_space import seen_through
 from p2gs.models.handover import PartMotions
 from p2gs.models.screw_polish import PolishConfig, Side, allowed_step, apply_step, photometric_cost, polish
 from p2gs.ops import se3
+
+NOISE = 0.01  # change of the mean landing cost (0..1) that is none: the true motions of zoo objects differ by less from those found beside them
 
 
 def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor:
@@ -44,7 +47,21 @@ def refine(
         return motions
     sides = sides_of(states, motions, views, config, stacks)
     result, _ = polish(sides, motions.transforms, motions.types, config, seed=seed, backend=backend, device=device)
+    if isinstance(stacks, SurfaceStacks):
+        result = uncontradicted(states, motions, result, stacks)
     return replace(motions, transforms=result)
+
+
+def uncontradicted(states, motions: PartMotions, refined: Tensor, surfaces: SurfaceStacks) -> Tensor:
+    """Of the refined motions [K-1, 4, 4] those under which a part's surface arrives as well as before, to within ``NOISE``; of the others
+    what they were: where the states show different sides of a plate, photographs pull it to where neither state has its surface."""
+    labels = surfaces.surfel_labels([s.gaussians.means.detach().cpu() for s in states], motions.labels)
+    out = refined.clone()
+    for k in range(len(motions)):
+        before, after = (surfaces.arrival(labels, T, motions.types, k) for T in (motions.transforms, refined))
+        if after > before + NOISE:
+            out[k] = motions.transforms[k]
+    return out
 
 
 def single_ways(

@@ -89,12 +89,10 @@ def _discovery(d: dict, say) -> None:
     if not found["parts"]:
         say("discovery", "No motion explains what moved: no moving part was found.")
     if found["chosen"] is not None and len(found["explanations"]) > 1:
-        ranks = [e.get("rank", e["cost"]) for e in found["explanations"]]
-        best = ranks[found["chosen"]]
-        second = min(r for i, r in enumerate(ranks) if i != found["chosen"])
-        if second < best * (1 + limit("close_call")):
-            gap = second / best - 1
-            text = f"Two explanations fit the images almost alike ({gap:.1%} apart): other parts are possible (try another seed)."
+        ranks = [e["rank"] for e in found["explanations"]]
+        gap = min(r for i, r in enumerate(ranks) if i != found["chosen"]) - ranks[found["chosen"]]
+        if gap < limit("close_call"):
+            text = f"Two explanations fit almost alike (energies {gap:.3f} apart): other parts are possible (try another seed)."
             say("discovery", text, "note")
     chosen = found["explanations"][found["chosen"]] if found["chosen"] is not None else {}
     for r in chosen.get("reductions", []):

@@ -143,10 +143,10 @@ def test_the_page_tells_where_reconsidered_explanations_led(tmp_path):
     stages, twin, views = small_run()
     d = write_diagnosis(tmp_path, stages, twin, views, min_margin=0.1)
     assert d["discovery"]["contests"][0]["rank"] == 0.1 and "where that led" not in (tmp_path / "diagnostics.html").read_text()
-    d["discovery"]["explanations"].append({"types": ["revolute"], "cost": 0.12})
+    d["discovery"]["explanations"].append({"types": ["revolute"], "cost": 0.12, "rank": 0.12})
     d["discovery"]["contests"].append({"explanation": 1, "types": ["prismatic", "revolute"], "rank": 0.0987})
     html = page(d, [], "run")
-    assert html.count("where that led") == 2 and "0.0987" in html and "prismatic, revolute" in html
+    assert html.count("where that led") == 2 and "0.099" in html and "prismatic, revolute" in html
 
 
 def test_without_discovery_and_without_parts(tmp_path):

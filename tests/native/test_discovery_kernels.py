@@ -61,13 +61,14 @@ def make_motions(n: int, reach: float = 0.6) -> Motions:
     """Turns and slides, the first ones small: the rest lands partly outside the grids."""
     amount = torch.linspace(0.01, reach, n) * torch.where(torch.arange(n) % 3 == 0, -1.0, 1.0)
     axis = torch.nn.functional.normalize(torch.randn(n, 3), dim=1)
-    return Motions(torch.arange(n) % 2 == 0, axis, torch.rand(n, 3) - 0.5, amount)
+    thick = torch.tensor([0.0, 0.03, 0.1])[torch.arange(n) % 3]
+    return Motions(torch.arange(n) % 2 == 0, axis, torch.rand(n, 3) - 0.5, amount, thick)
 
 
 def twin(problem: Problem, motions: Motions, state: int, index, claimed=None):
     s, back = problem.surfels[state], state == 1
     x, n = motions.apply(s.points[index], back), motions.rotate(s.normals[index], back)
-    return problem.landings[1 - state].cost(x, n, s.colours[index], claimed)
+    return problem.landings[1 - state].cost(x, n, s.colours[index], claimed, motions.thick[:, None].expand(x.shape[:-1]))
 
 
 def assert_alike(problem: Problem, motions: Motions, state: int, index, claimed=None):
@@ -90,6 +91,24 @@ def test_landing_cost_against_torch(isa, threads, B, P, claimed):
     for state in (0, 1):
         for reach in (0.02, 0.6, 30.0):
             assert_alike(problem, make_motions(B, reach), state, index, torch.rand(700) if claimed else None)
+
+
+def test_a_plate_shows_its_other_side(isa):
+    """A slab turned half about its edge: the side that one state saw lands a thickness behind the one that the other state sees."""
+    g = torch.Generator().manual_seed(0)
+    p = torch.rand(700, 3, generator=g) - 0.5
+    front, back = p.clone(), p.clone()
+    front[:, 0], back[:, 0] = -0.2, -0.24  # in free space nowhere (``NoViews`` sees x > 0.1)
+    facing = torch.tensor([1.0, 0.0, 0.0]).expand(700, 3)
+    both = [Surfels(front, facing, torch.zeros(700, 3), 0.05, 0.004), Surfels(back, -facing, torch.ones(700, 3), 0.05, 0.004)]
+    lo, hi = torch.full((3,), -0.55), torch.full((3,), 0.56)
+    scale, none = Scale(tau=0.02, tp=0.02, spacing=0.05, diag=1.9), torch.zeros(700, dtype=torch.bool)
+    source, target = (Landing(s, none, NoViews(), lo, hi, scale, 6000.0) for s in both)
+    still = Motions(torch.ones(3, dtype=torch.bool), facing[:3], torch.zeros(3, 3), torch.zeros(3), torch.tensor([0.0, 0.04, 0.3]))
+    cost, met = target.arrive(still, source, torch.arange(700))
+    assert float((cost[0] - Landing.HIDDEN).abs().max()) < 1e-6  # who knows one side only: hidden
+    assert float((cost[1] - Landing.TWO_SIDED).abs().mean()) < 0.02 and bool((met[1] >= 0).all())
+    assert float((cost[2] - Landing.HIDDEN).abs().max()) < 1e-6  # too thick: nothing is there
 
 
 def test_landing_cost_spans_its_range(isa):

@@ -43,6 +43,6 @@ class DiscoveryConfig:
     split: float = 0.3
     min_mass: float = 0.015
     min_moved: int = 12
-    search_weight: float = 0.4
+    search_weight: float = 1.0
     searches: int = 2
     candidates: int = 4

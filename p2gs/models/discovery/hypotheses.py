@@ -36,7 +36,7 @@ def normal_peaks(normals: Tensor, n: int, apart: float = 25.0, least: float = 0.
         if float(score[k]) < least:
             break
         d = grid[k]
-        for width in (15.0, 10.0, 6.0):
+        for width in (15.0, 10.0, 6.0, 3.0, 2.0):
             c = normals @ d
             near = c.abs() > math.cos(math.radians(width))
             if near.any():

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from p2gs.models.discovery.config import DiscoveryConfig
-from p2gs.models.discovery.evidence import StateEvidence
+from p2gs.models.discovery.evidence import DepthStack, StateEvidence
 from p2gs.models.discovery.finish import Explanation, settle_parts, split_amounts, with_amounts
 from p2gs.models.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.models.discovery.labels import Graph, Labelling, label
@@ -112,6 +112,43 @@ def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate
     return Candidate(found_motions(found.problem, motions, labelling), found.problem.surfels, labelling.probability, 0.0, 0.0)
 
 
+def surface_energy(found: Discovery, transforms: Tensor, types: list[str]) -> float:
+    """What the surfaces say against motions [K, 4, 4], every surfel choosing anew: where they land in seen-free space or on what has another
+    colour, implausible joints, a price on each part, less what the motions explain. Lower is better; 0 without motions."""
+    if found.search is None or not types:
+        return 0.0
+    motions = sided(found.problem, as_motions(transforms, types))
+    labelling = label(found.problem, motions, found.graphs)
+    return judged(found.search, Explanation(motions, labelling, 0.0, total_score(found.problem, motions, labelling))).score
+
+
+class SurfaceStacks(list):
+    """Rendered depth of both states (a list of two ``DepthStack``: the problem's or, where given, others) and the surfaces that were found in
+    it, which judge refined motions."""
+
+    def __init__(self, problem: Problem, stacks: list[DepthStack] | None = None):
+        super().__init__(problem.stacks if stacks is None else stacks)
+        self.problem = problem
+
+    def arrival(self, labels: list[Tensor], transforms: Tensor, types: list[str], part: int) -> float:
+        """Mean landing cost (0..1, both states alike) of a part's surfels under its motion, the thickness of plate chosen to suit it.
+
+        labels: part of each surfel of both states (0 static).  transforms [K, 4, 4].
+        """
+        motion = sided(self.problem, as_motions(transforms[part : part + 1], types[part : part + 1]))
+        costs = []
+        for s in (0, 1):
+            index = (labels[s] == part + 1).nonzero().squeeze(1)
+            if len(index):
+                costs.append(float(self.problem.cost(motion, s, index)[0].mean()))
+        return sum(costs) / max(len(costs), 1)
+
+    def surfel_labels(self, gaussians: list[Tensor], labels: list[Tensor]) -> list[Tensor]:
+        """Label of the Gaussian (means [N, 3], labels [N], by state) next to each surfel."""
+        pairs = zip(gaussians, labels, self.problem.surfels, strict=True)
+        return [lab[torch.from_numpy(cKDTree(means.numpy()).query(s.points.numpy())[1])] for means, lab, s in pairs]
+
+
 def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int | None, count: int = 2) -> list[tuple[Tensor, str]]:
     """Motions [4, 4] that best explain what all parts but ``part`` leave over (None: what all leave over), and their types: up to
     ``count`` turns and as many slides, without the part's own.
@@ -122,7 +159,7 @@ def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int
     if search is None:
         return []
     own = sided(found.problem, as_motions(transforms, types))
-    rest = search.pool.add(own[torch.tensor([k for k in range(len(types)) if k != part], dtype=torch.long)]).tolist()
+    rest = search.pool.add(own if part is None else without(own, part)).tolist()
     motions, _ = search.propose(rest, 96, 12, each=True)
     if not len(motions):
         return []
@@ -151,13 +188,15 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
     """Label and fit a chosen set; part those that share an axis but not an amount (up to ``most``); drop those without mass; score."""
     cfg = problem.config
     motions, labelling = settle_parts(problem, graphs, motions, axes)
+    while (pair := twins(problem, motions, labelling)) is not None:
+        motions, labelling = settle_parts(problem, graphs, without(motions, pair), axes)
     while len(motions) < most:
         tried = [split_amounts(problem, labelling, graphs, motions, k) for k in range(len(motions))]
         k = max(range(len(tried)), key=lambda i: tried[i][0])
         if tried[k][0] < cfg.split:
             break
         more, relabelled = settle_parts(problem, graphs, with_amounts(motions, k, *tried[k][1:]), axes)
-        if min(masses(problem, relabelled)) < cfg.min_mass or same_motion(problem, more, k, len(more) - 1):
+        if min(masses(problem, relabelled)) < cfg.min_mass or twins(problem, more, relabelled) is not None:
             break
         motions, labelling = more, relabelled
     while len(motions):
@@ -165,8 +204,7 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
         k = min(range(len(mass)), key=lambda i: mass[i])
         if mass[k] >= cfg.min_mass:
             break
-        motions = motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
-        motions, labelling = settle_parts(problem, graphs, motions, axes, rounds=1)
+        motions, labelling = settle_parts(problem, graphs, without(motions, k), axes, rounds=1)
     return prune(problem, graphs, motions, labelling, value, limit, axes)
 
 
@@ -210,7 +248,7 @@ def prune(
     while len(motions) > 1:
         tried = []
         for k in range(len(motions)):
-            fewer = motions[torch.tensor([i for i in range(len(motions)) if i != k])]
+            fewer = without(motions, k)
             tried.append((total_score(problem, fewer, label(problem, fewer, graphs)), k, fewer))
         least, _, fewer = min(tried, key=lambda t: t[:2])
         if least > score and len(motions) <= limit:
@@ -229,10 +267,29 @@ def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> flo
     return image_score(problem, motions, labelling) + problem.config.part_cost * len(motions) + 0.5 * doubt
 
 
-def same_motion(problem: Problem, motions: Motions, i: int, j: int) -> bool:
-    """Do two motions differ by less than the surfaces' own disagreement?"""
-    probe = torch.cat([problem.surfels[s].points[problem.samples[s]] for s in (0, 1)])
-    return float(motions[i : i + 1].swept(probe, motions[j : j + 1])) < 0.7 * problem.scale.tp
+def twins(problem: Problem, motions: Motions, labelling: Labelling) -> int | None:
+    """The smaller part of two that touch and whose motions carry their points to the same places, to within the tolerance across surfaces:
+    surfaces cannot tell them apart (the photographs are asked later). None where there are no such two."""
+    mass = masses(problem, labelling)
+    for small in sorted(range(len(motions)), key=mass.__getitem__):
+        for large in (k for k in range(len(motions)) if k != small):
+            for s in (0, 1):
+                a, b = (problem.surfels[s].points[labelling.labels(s) == k + 1] for k in (small, large))
+                if len(a) and len(b) and touching(a, b, problem.scale.spacing):
+                    gap = motions[small : small + 1].apply(a, s == 1) - motions[large : large + 1].apply(a, s == 1)
+                    if float(gap.pow(2).sum(-1).mean().sqrt()) < problem.scale.tp:
+                        return small
+    return None
+
+
+def touching(a: Tensor, b: Tensor, spacing: float) -> bool:
+    """Do some of the surfels a [N, 3] lie as near to b [M, 3] as neighbours on one surface do?"""
+    return bool((cKDTree(b.numpy()).query(a.numpy())[0] < 2 * spacing).sum() > 2)
+
+
+def without(motions: Motions, k: int) -> Motions:
+    """All motions but ``k``."""
+    return motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
 
 
 def masses(problem: Problem, labelling: Labelling) -> list[float]:

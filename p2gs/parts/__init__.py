@@ -1,0 +1,1 @@
+"""What makes a part one part: one body with one motion."""
