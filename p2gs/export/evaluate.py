@@ -12,6 +12,7 @@
                  depth_bad the fraction off by more than 1 % of the object's diagonal
     chamfer      {static|movable|whole: {value, floor}, parts, failures}: x1000, see metrics.chamfer.ChamferReport
     penetration  {mean, max}: fraction of the moving Gaussians inside the base, over five states
+    slots        with exact_parts: what became of every part slot, see models.slots.slot_report
     seconds      time the evaluation took
     missing      sentences
 """
@@ -25,9 +26,10 @@ from typing import TYPE_CHECKING, Optional
 
 import numpy as np
 
-from p2gs.export.mesh import read_meshes
+from p2gs.export.mesh import read_mesh, read_meshes
 from p2gs.export.paint import draw, rasterizer_of
 from p2gs.export.pose import pose
+from p2gs.export.protocol import surface_options
 from p2gs.export.twin_json import load_twin
 from p2gs.export.views import bounds
 from p2gs.metrics.joints import evaluate_joints
@@ -65,6 +67,8 @@ def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict
     with rasterizer_of(run_dir):
         metrics["views"] = view_scores(obj, scene, missing)
     metrics["penetration"] = evaluate_penetration(obj)
+    if (run_dir / "slots.json").is_file():
+        metrics["slots"] = json.loads((run_dir / "slots.json").read_text())
     metrics["seconds"] = round(time.perf_counter() - began, 2)
     metrics["missing"] = missing
     path = run_dir / "metrics.json"
@@ -147,7 +151,8 @@ def surface_scores(run_dir: Path, truth: "GroundTruth", assignment: dict[int, in
         if true.static is None or not true.dynamic:
             missing.append(f"the ground truth has no meshes of the {name} state's parts")
             return None
-        pred[name] = PartMeshes(made[0], made[1:])
+        whole_apart = surface_options(run_dir).whole == "separate"
+        pred[name] = PartMeshes(made[0], made[1:], read_mesh(Path(run_dir) / "meshes" / name / "whole.ply") if whole_apart else None)
         whole = None if true.whole is None else _load(true.whole)
         gt[name] = PartMeshes(_load(true.static), [_load(p) for p in true.dynamic], whole)
     return evaluate_chamfer(pred, gt, assignment).to_dict()

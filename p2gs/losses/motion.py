@@ -130,11 +130,12 @@ class Art(Loss):
             moved = carried(parts.transforms, pairs.mu0)
         else:
             moved = carried(parts.at(1.0), parts.means_canonical.index_select(0, pairs.index))
-        tau = self.tau(inputs)
+        tau = self.tau(parts.extent, inputs.step, inputs.total_steps)
         if self.variant == "paper":
             blended = (pairs.probs.T[:, None] * moved).sum(0).T
             movable = 1 - pairs.probs[:, :1]
-            per_pair = squared(blended + movable * self.force(blended, parts, tau) - pairs.mu1, self.robust, parts.extent)
+            force = self.force(blended, parts.repel_points, parts.extent, tau)
+            per_pair = squared(blended + movable * force - pairs.mu1, self.robust, parts.extent)
         else:
             cost = squared(self.push(moved, pairs.probs, parts, tau) - pairs.mu1.T, self.robust, parts.extent, dim=1)
             per_pair = (pairs.probs.T * cost).sum(0)
@@ -144,26 +145,27 @@ class Art(Loss):
             total = total + self.lambda_rot * (angle.mean() if self.reduce == "mean" else angle.sum())
         return total
 
-    def tau(self, inputs: LossInputs) -> float:
+    def tau(self, extent: float, step: int, total_steps: int) -> float:
         """The force's largest length now, in scene units."""
-        tau = self.tau_max * inputs.parts.extent
+        tau = self.tau_max * extent
         if self.variant == "paper" or self.anneal <= 0:
             return tau
-        return tau * max(0.0, 1 - inputs.step / max(inputs.total_steps, 1) / self.anneal)
+        return tau * max(0.0, 1 - step / max(total_steps, 1) / self.anneal)
 
-    def force(self, points: Tensor, parts: PartState, tau: float) -> Tensor:
-        if parts.repel_points is None or self.k_r == 0 or tau <= 0:
+    def force(self, points: Tensor, repel_points: Tensor | None, extent: float, tau: float) -> Tensor:
+        """F [N, 3] at points [N, 3] from repel_points [R, 3], at most ``tau`` long, all in scene units."""
+        if repel_points is None or len(repel_points) == 0 or self.k_r == 0 or tau <= 0:
             return torch.zeros_like(points)
         reduce = "sum" if self.variant == "paper" else "local"
         force = repel_force(
             points,
-            parts.repel_points,
+            repel_points,
             k_r=self.k_r,
             exponent=self.exponent,
             eps=self.eps,
             reduce=reduce,
             tau_max=tau,
-            radius=self.radius * parts.extent,
+            radius=self.radius * extent,
         )
         return force if self.sign == "paper" else -force
 
@@ -175,5 +177,5 @@ class Art(Loss):
         feels[0] = False
         (chosen,) = feels.flatten().nonzero(as_tuple=True)
         flat = moved.transpose(0, 1).flatten(1)
-        force = self.force(flat.index_select(1, chosen).T, parts, tau)
+        force = self.force(flat.index_select(1, chosen).T, parts.repel_points, parts.extent, tau)
         return flat.scatter_add(1, chosen.expand(3, -1), force.T).unflatten(1, feels.shape).transpose(0, 1)

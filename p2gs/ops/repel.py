@@ -10,6 +10,7 @@ from torch import Tensor
 from p2gs.native import native, num_threads
 
 Reduce = Literal["sum", "mean", "local"]
+EVERYWHERE = 1e6  # a radius (units of the points) that takes in every repel point; its square fits a float32
 
 
 def repel_force(
@@ -31,16 +32,17 @@ def repel_force(
     "mean" divides by R; "local" is the mean over the repel points nearer than ``radius``, and zero where there are none.
     The direction is the paper's: *towards* the repel points. In the residual x + F - target of the articulation loss the optimum
     x = target - F then lies away from them. Differentiable in both sets of points. Memory: ``chunk`` pairs at a time in the
-    forward pass (autograd keeps them all); "local" on the CPU visits only the pairs within the radius, in float32 and without a gradient to
-    the repel points by a native kernel.
+    forward pass (autograd keeps them all). On the CPU "local" visits only the pairs within the radius; in float32 and without a gradient to
+    the repel points a native kernel does all three, which keeps nothing by pair.
     Raises ValueError when "local" has no radius.
     """
     if reduce == "local" and (radius is None or radius <= 0):
         raise ValueError("repel_force(reduce='local') needs a positive radius")
     if points.shape[0] == 0 or repel_points.shape[0] == 0:
         return torch.zeros_like(points)
-    if reduce == "local" and _native_applies(points, repel_points):
-        force = _Local.apply(points, repel_points, float(exponent), float(eps), float(radius))
+    if _native_applies(points, repel_points):
+        force = _Mean.apply(points, repel_points, float(exponent), float(eps), float(radius) if reduce == "local" else EVERYWHERE)
+        force = force * len(repel_points) if reduce == "sum" else force
     elif reduce == "local" and points.device.type == "cpu":
         force = _local_sparse(points, repel_points, exponent, eps, radius)
     else:
@@ -73,8 +75,8 @@ def _native_applies(points: Tensor, repel_points: Tensor) -> bool:
     return native is not None and not repel_points.requires_grad and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in both)
 
 
-class _Local(torch.autograd.Function):
-    """The slope of the force by the point comes with the force and waits for the backward pass."""
+class _Mean(torch.autograd.Function):
+    """Mean pull of the repel points within ``radius``. The slope of the force by the point comes with the force and waits for the backward pass."""
 
     @staticmethod
     def forward(ctx, points, repel_points, exponent, eps, radius):
