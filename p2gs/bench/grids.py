@@ -178,7 +178,8 @@ def _grid(filled: Filled, published: Sequence[str], foreign: Sequence[str], titl
     for row in rows:
         for e in row.entries:
             e.notes = [numbers[i] for i in e.notes]
-    return Grid(filled.table.name, title + preset_of(filled.results), heads, columns, rows, {numbers[i]: text for i, text in sorted(filled.used.items())})
+    notes = {numbers[i]: text for i, text in sorted(filled.used.items())}
+    return Grid(filled.table.name, title + preset_of(filled.results), heads, columns, rows, notes)
 
 
 def _metric_rows(f: Filled, metric: str, objects: Sequence[str]) -> Iterator[Row]:

@@ -87,7 +87,8 @@ def summary(results: Results) -> Grid:
         if any(floors.values()):
             rows.append(Row([column, "sampling floor"], [Entry(m, column, s.mean if (s := floors[m]) else None) for m in metrics], "floor"))
     mark_best(rows)
-    return Grid("summary", f"{results.name}: all runs{preset_of(results)}", ["Object", "Setting"], [METRICS[m].title for m in metrics], rows)
+    title = f"{results.name}: all runs{preset_of(results)}"
+    return Grid("summary", title, ["Object", "Setting"], [METRICS[m].title for m in metrics], rows)
 
 
 # -- tests -------------------------------------------------------------------------------------------------------------------------

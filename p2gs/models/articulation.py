@@ -46,8 +46,8 @@ class ArticulationConfig(ImageConfig):
     """Options of the articulation phase.
 
     init: "discovery" starts psi, f and xi from the discovered parts; "identity" and "random" (the paper's own) learn from nothing.
-    psi: "init" begins as ``init`` says; "random" begins psi at random wherever the screws come from, so that nothing of the discovered
-    labels is used.  embedding_dim: of psi.  temperature .. temperature_end: softmax temperature, falling geometrically until ``harden_until``
+    psi: "init" begins as ``init`` says; "random" begins psi at random wherever the screws come from: nothing of the discovered labels
+    is used.  embedding_dim: of psi.  temperature .. temperature_end: softmax temperature, falling geometrically until ``harden_until``
     (fraction of the phase); the paper's letter is 1 throughout.  rate_screws: paper 1e-3.  screws_from: fraction of the phase
     at which screws begin to learn.  neighbours, refresh: k of the neighbourhood KL, and steps between kNN and pair refreshes.
     pair_target: "matched" holds the pairs of the fusion; "nearest" renews the observed centres by nearest neighbours in each state
@@ -86,8 +86,8 @@ def check_losses(config: ArticulationConfig, losses: dict[str, Loss], canonical:
     late = config.pair_target != "nearest" or config.nearest_from > 0
     if vanish and late and not bool(canonical.paired.any()):
         raise UserError(
-            f"phases.articulation.losses: {', '.join(vanish)} need observed pairs, and fusion has made none; switch them off (null), or take "
-            "nearest neighbours throughout (pair_target: nearest, nearest_from: 0.0)"
+            f"phases.articulation.losses: {', '.join(vanish)} need observed pairs, and fusion has made none; "
+            "switch them off (null), or take nearest neighbours throughout (pair_target: nearest, nearest_from: 0.0)"
         )
     if config.repel.render and "art" not in losses:
         raise UserError("phases.articulation.repel.render: draws the force of losses.art, which is switched off; expected render: false")

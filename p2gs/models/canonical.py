@@ -14,7 +14,9 @@ from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors, UserError
 
-__all__ = ["CanonicalConfig", "beta_weight", "blend", "carry", "farthest_points", "fuse", "hungarian_pairs", "motion_richness", "with_static"]
+__all__ = [
+    "CanonicalConfig", "beta_weight", "blend", "carry", "farthest_points", "fuse", "hungarian_pairs", "motion_richness", "with_static",
+]  # fmt: skip
 
 
 @dataclass
@@ -31,7 +33,8 @@ class CanonicalConfig:
     Gaussians by beta-weighted averages of all parameters and keeps unmatched ones by ``unmatched``: "static" (those of the
     motion-rich state that did not move), "none" or "all". "none" is the ablation without canonical initialisation: the start
     state's Gaussians as they are, at canonical time 0, with no observed pairs.
-    min_opacity: fainter Gaussians take no part in D and matching (0 = all do).  trim: fraction of the largest distances left out of D (floaters).
+    min_opacity: fainter Gaussians take no part in D and matching (0 = all do).  trim: fraction of the largest distances left out of D
+    (floaters).
     free_space: tolerance (internal units) of the test that drops or relabels what the other state's cameras see through; 0 = off.
     hidden: what only the poorer state saw is kept where this share of the richer state's views has something in front of it; elsewhere
     the richer state shows what there is (0 = all is kept; needs free_space).
@@ -166,7 +169,7 @@ def _fuse_chords(g0, g1, motions, solid, betas, start_is_rich, config, num_parts
 
 
 def _cluster_betas(start: Tensor, end: Tensor, all0: Tensor, all1: Tensor, movable: int, rest: float, trim: float) -> Tensor:
-    """beta [M] of each pair: of its motion cluster by the cluster's own D, ``rest`` where it is still. all0 [N, 3], all1 [M', 3]: the states."""
+    """beta [M] of each pair: of its motion cluster by the cluster's own D, ``rest`` where it is still. all0, all1 [N, 3]: the states."""
     cluster = motion_clusters(start, end, movable)
     betas = torch.full((len(start),), rest, dtype=torch.float64)
     for k in range(1, movable + 1):

@@ -56,7 +56,7 @@ def hungarian_pairs(a: Tensor, b: Tensor, count: int, smaller_whole: bool = Fals
 
 
 def motion_clusters(start: Tensor, end: Tensor, clusters: int, rounds: int = 20) -> Tensor:
-    """Pairs [M, 3] of both states in ``clusters`` groups that move: 0 (still) .. clusters, [M] int64. Stands for parts before any are known.
+    """Pairs [M, 3] of both states in ``clusters`` groups that move: 0 (still) .. clusters, [M] int64. For parts before any are known.
 
     k-means on (where a pair begins, where it ends), begun at farthest points; deterministic.
     """

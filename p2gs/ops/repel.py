@@ -76,7 +76,7 @@ def _native_applies(points: Tensor, repel_points: Tensor) -> bool:
 
 
 class _Mean(torch.autograd.Function):
-    """Mean pull of the repel points within ``radius``. The slope of the force by the point comes with the force and waits for the backward pass."""
+    """Mean pull of the repel points within ``radius``. Its slope by the point comes with it and waits for the backward pass."""
 
     @staticmethod
     def forward(ctx, points, repel_points, exponent, eps, radius):
