@@ -1,4 +1,4 @@
-"""LPIPS of rendered views (Zhang et al. 2018, arXiv:1801.03924), AlexNet backbone, through torchmetrics; needs ``pip install 'p2gs[lpips]'``.
+"""LPIPS of rendered views (Zhang et al. 2018, arXiv:1801.03924), AlexNet backbone, through torchmetrics; needs the extra ``lpips``.
 
 torchmetrics brings the linear layers; the backbone's ImageNet weights are a file of 240 MB that torchvision would download. Nothing is
 downloaded here: they come from a path that the user gives, or from torch's cache (``torch.hub.get_dir()/checkpoints``), where any

@@ -32,9 +32,9 @@ def repel_force(
     "mean" divides by R; "local" is the mean over the repel points nearer than ``radius``, and zero where there are none; "within" is
     the sum over those.
     The direction is the paper's: *towards* the repel points. In the residual x + F - target of the articulation loss the optimum
-    x = target - F then lies away from them. Differentiable in both sets of points. Memory: ``chunk`` pairs at a time in the
-    forward pass (autograd keeps them all). On the CPU "local" and "within" visit only the pairs within the radius; in float32 and without gradient to
-    the repel points a native kernel does all four, which keeps nothing by pair.
+    x = target - F then lies away from them. Differentiable in both sets of points. Memory: ``chunk`` pairs at a time in the forward
+    pass (autograd keeps them all). On the CPU "local" and "within" visit only the pairs within the radius; in float32 and without a
+    gradient to the repel points a native kernel does all four, which keeps nothing by pair.
     Raises ValueError when "local" or "within" has no radius.
     """
     if reduce in ("local", "within") and (radius is None or radius <= 0):

@@ -1,4 +1,4 @@
-"""Every ablation config takes two steps of fusion and articulation, on the default and the literal preset, and runs what it is named for."""
+"""Every ablation takes two steps of fusion and articulation, on the default and the literal preset, and runs what it is named for."""
 
 from pathlib import Path
 
