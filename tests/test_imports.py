@@ -30,20 +30,8 @@ APART = [("losses", "metrics"), ("losses", "data"), ("metrics", "losses"), ("met
 ALLOWED = {
     ("p2gs.export.evaluate", "p2gs.config"): "the scene of a run is read from its config.yaml",
 }
-OPTIONAL = [
-    "gsplat",
-    "viser",
-    "imageio_ffmpeg",
-    "pxr",
-    "mujoco",
-    "yourdfpy",
-    "embreex",
-    "hypothesis",
-    "beartype",
-    "matplotlib",
-    "submitit",
-    "ray",
-]
+OPTIONAL = ["gsplat", "viser", "imageio_ffmpeg", "pxr", "mujoco", "yourdfpy", "embreex", "hypothesis", "beartype",
+            "matplotlib", "submitit", "ray"]
 
 
 def modules():

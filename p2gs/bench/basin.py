@@ -1,8 +1,8 @@
 """``python -m p2gs.bench.basin BENCH_DIR``: up to which opening each setting of a bench like ``bench/basin.yaml`` finds the joint.
 
-Scenes are one object at several openings, named NAME_<degrees>. A run succeeds where every joint is found with its type, and axis and motion
-are within a degree. The basin of a setting is the largest opening that two of three of its seeds solve. Writes basin.md, basin.csv and,
-with matplotlib, basin.png into BENCH_DIR/tables.
+Scenes are one object at several openings, named NAME_<degrees>. A run succeeds where every joint is found with its type, and axis and
+motion are within a degree. The basin of a setting is the largest opening that two of three of its seeds solve. Writes basin.md, basin.csv
+and, with matplotlib, basin.png into BENCH_DIR/tables.
 """
 
 from __future__ import annotations

@@ -99,9 +99,10 @@ class Art(Loss):
     variant: "local" takes the expectation of the squared residual over the soft membership, and for F the sum over the repel
     points within ``radius`` of strength tau_max (radius / d)^(exponent - 1) towards each, clipped at ``tau_max`` (radius and tau_max:
     fractions of the extent) and annealed to nothing at ``anneal`` (fraction of the phase): a force that stays leaves the joint off by
-    tau_max. Distances in radii keep it below the clip for any exponent, so that exponent and count of the points act. strength: share of
-    tau_max that one point at the radius exerts; 0.005 keeps the median force at 0.1 to 0.5 tau_max. "paper" blends positions by membership (appendix, "Part Assignment
-    Details") and sums F over all repel points, clipped, to the end; with k_r = 5e-4 and 2,000 points it is at its clip everywhere.
+    tau_max. Distances in radii keep it below the clip for any exponent, so that exponent and count of the points act. "paper" blends
+    positions by membership (appendix, "Part Assignment Details") and sums F over all repel points, clipped, to the end; with
+    k_r = 5e-4 and 2,000 points it is at its clip everywhere.
+    strength: share of tau_max that one point at the radius exerts; 0.005 keeps the median force at 0.1 to 0.5 tau_max.
     source: "observed", or "canonical" to move the Gaussians' canonical centres to state 1 instead of mu0 (they get gradients).
     sign: "paper", or "away" to turn F around (then the optimum is nearer to the repel points).  k_r = 0 switches F off.
     min_prob: memberships below it feel no force (saves most of the work).  reduce, sample, robust: as in ``vector``.
