@@ -113,6 +113,8 @@ def parser(prog: str = "p2gs") -> Parser:
     bench.add_argument("-c", "--config", **several, metavar="FILE", help="YAML files of benches, such as bench/paris.yaml")
     bench.add_argument("--root", metavar="DIR", help="the tree that holds the objects")
     bench.add_argument("--out", metavar="DIR", help="result folder (default runs/bench/<name>)")
+    bench.add_argument("--preset", metavar="NAME", help="instead of the bench's own preset, such as paper_literal")
+    bench.add_argument("--num_parts", metavar="N", help="of settings that say nothing of it: a number, auto, gt, gt+1, ...")
     bench.add_argument("--objects", nargs="+", metavar="NAME", help="these instead: benchmarks, object ids or scene folders below --root")
     bench.add_argument("--settings", nargs="+", metavar="NAME", help="only these settings")
     bench.add_argument("--seeds", nargs="+", metavar="N", help="default 0 1 2")

@@ -33,7 +33,9 @@ class Options:
 
     seed: every random choice is a function of it.  run: result folder, default runs/<scene>.  device: auto takes CUDA where
     there is one.  threads: of the CPU kernels, and of torch outside training steps, default all cores.  rasterizer: a registered backend
-    or auto.  num_parts: including the static base; auto finds out.  plugins: modules that register losses, callbacks, phases, ...
+    or auto.  num_parts: including the static base; auto finds out, and a number is the most that discovery may find.
+    exact_parts: num_parts is the number of slots instead: of more parts found the alike become one, fewer get spare slots beside them.
+    plugins: modules that register losses, callbacks, phases, ...
     """
 
     seed: int = 0
@@ -42,11 +44,14 @@ class Options:
     threads: Optional[int] = None
     rasterizer: str = "auto"
     num_parts: Union[int, Literal["auto"]] = "auto"
+    exact_parts: bool = False
     plugins: list[str] = field(default_factory=list)
 
     def __post_init__(self):
         if self.num_parts != "auto" and self.num_parts < 2:
             raise UserError(f"num_parts: expected at least 2 (it counts the static base), got {self.num_parts}")
+        if self.exact_parts and self.num_parts == "auto":
+            raise UserError("exact_parts: true needs a number of parts (--num_parts N)")
         if self.threads is not None and self.threads < 1:
             raise UserError(f"threads: expected at least 1, got {self.threads}")
 
@@ -76,6 +81,7 @@ class RunConfig:
         options: Options = build({name: values[name] for name in own.children}, own)
         self.seed, self.run, self.device, self.threads = options.seed, options.run, options.device, options.threads
         self.rasterizer, self.num_parts, self.plugins = options.rasterizer, options.num_parts, options.plugins
+        self.exact_parts = options.exact_parts
         self.data_options: Plain = values["data"]
         self._data: Optional[LightningDataModule] = None
         self.phases: dict[str, PhaseSection] = {}
@@ -220,7 +226,7 @@ def run_schema(data_format: Optional[str]) -> Section:
     losses, callbacks = switches(LOSSES.items()), switches(CALLBACKS.items())
     root = section_of(Options)
     root.children["p2gs"] = Leaf(dict, {})  # what save_config notes; read over
-    root.children["data"] = section_of(_dataset(data_format)) if data_format else Section(dict)
+    root.children["data"] = section_of(_dataset(data_format)) if data_format else _any_data()
     root.children["data"].children = {"format": Leaf(Optional[str], None), **root.children["data"].children}
     phases = root.children["phases"] = Section(dict)
     for name, cls in PHASES.items():
@@ -242,6 +248,14 @@ def _dataset(name: str):
     if name not in DATASETS:
         raise UserError(f"data.format: there is no '{name}'{suggest(str(name), dataset_names())}")
     return DATASETS[name]
+
+
+def _any_data() -> Section:
+    """What a preset may say of data before a format is known: the options that every source of photographs has."""
+    from p2gs.data.base import TwoStateData
+
+    common = section_of(TwoStateData)
+    return Section(dict, {name: child for name, child in common.children.items() if name != "root"})
 
 
 def dataset_names() -> list[str]:

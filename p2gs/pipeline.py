@@ -33,6 +33,7 @@ from p2gs.models.part_motions import find_part_motions
 from p2gs.models.phase import Phase
 from p2gs.models.sharpen import SharpenPhase
 from p2gs.models.single_state import SingleStatePhase
+from p2gs.models.slots import merge_to, slot_report
 from p2gs.native import keep_memory
 from p2gs.side_stage import SideStage, can_run_beside
 from p2gs.stage_times import note_stage
@@ -95,6 +96,9 @@ class Pipeline:
         }
         if stage.startswith("single_state"):
             del common["num_parts"]
+        elif self.exact:  # discovery finds what there is; later stages take it to the number that was asked for
+            early = stage == "discovery" or stage.startswith("sharpen")
+            common |= {"num_parts": "auto"} if early else {"exact_parts": True}
         chain = [common]
         for name in STAGES:
             if name == "discovery" and self.init != "discovery":
@@ -103,6 +107,11 @@ class Pipeline:
             if stage.startswith(name):
                 break
         return hashlib.sha256(json.dumps([stage, chain], sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+    @property
+    def exact(self) -> bool:
+        """Whether ``num_parts`` is the number of slots beside discovery, not a limit for it."""
+        return self.cfg.exact_parts and self.init == "discovery"
 
     def file(self, stage: str) -> Path:
         return self.run_dir / "checkpoints" / f"{stage}.pt"
@@ -133,6 +142,10 @@ class Pipeline:
         states = [self.stage(name := f"sharpen_{s.state}", only, partial(self.train, name, partial(self.sharpen, s))) for s in states]
         if only == "sharpen":
             return self.run_dir
+        if self.exact:
+            motions, notes = merge_to(motions, found_in, self.cfg.num_parts)
+            for note in notes:
+                print(note, flush=True)
         fuse = partial(self.fusion, found_in, states, motions)
         canonical = self.stage("canonical_fusion", only, partial(self.train, "canonical_fusion", fuse))
         if only == "canonical_fusion":
@@ -217,7 +230,7 @@ class Pipeline:
             states,
             self.scene,
             self.views,
-            self.cfg.num_parts,
+            "auto" if self.exact else self.cfg.num_parts,
             self.cfg.phases["discovery"].config,
             seed=self.cfg.seed,
             backend=self.cfg.rasterizer,
@@ -246,7 +259,8 @@ class Pipeline:
                 counted["openings"] = lids
                 gone, come = (sum(c[k] for c in lids) for k in ("removed", "added"))
                 print(f"canonical_fusion: {gone} Gaussians before openings gave way to {come} on the walls behind them", flush=True)
-        options = {"stacks": stacks, "counted": counted, **self.common()}
+        known = None if self.cfg.num_parts == "auto" else self.cfg.num_parts
+        options = {"stacks": stacks, "counted": counted, "num_parts": known, **self.common()}
         return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, **options)
 
     def surfaces(self, states) -> Problem:
@@ -260,7 +274,7 @@ class Pipeline:
 
     def articulate(self, canonical, states, motions, section) -> Phase:
         extent = float((self.scene.box[1] - self.scene.box[0]).norm())
-        parts = len(motions) + 1 if motions is not None else self.cfg.num_parts
+        parts = len(motions) + 1 if motions is not None and not self.exact else self.cfg.num_parts
         return ArticulationPhase(section.config, section.losses, canonical, states, motions, parts, extent, self.views, **self.common())
 
     def train(self, stage: str, build: Callable[[Any], Phase]) -> Any:
@@ -340,6 +354,9 @@ class Pipeline:
         options = {"min_margin": config.unclear, "backend": self.backend, "twin_backend": self.cfg.rasterizer, "device": device}
         write_diagnosis(self.run_dir, stages, obj, self.views, **options)
         write_twin(obj, self.run_dir, self.scene)
+        if self.exact:
+            report = slot_report(learned, obj, record.slots, len(motions))
+            (self.run_dir / "slots.json").write_text(json.dumps(report, indent=1) + "\n")
         if config.exports:
             complete_run(self.run_dir, config.exports, log=partial(print, flush=True))
         joints = [e.as_dict() for e in record.evidence]

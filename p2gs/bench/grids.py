@@ -165,6 +165,11 @@ def fill(table: PaperTable, results: Results) -> list[Grid]:
     return [ours, paper]
 
 
+def preset_of(results: Results) -> str:
+    """Words for a title: the preset that p2gs's rows were made with."""
+    return f" ({OURS}: preset {results.about['preset']})" if results.about.get("preset") else ""
+
+
 def _grid(filled: Filled, published: Sequence[str], foreign: Sequence[str], title: str) -> Grid:
     make = {"objects": _objects, "metrics": _metrics, "groups": _groups, "settings": _settings, "average": _average}[filled.table.layout]
     heads, columns, rows = make(filled, [*published, *foreign])
@@ -173,7 +178,8 @@ def _grid(filled: Filled, published: Sequence[str], foreign: Sequence[str], titl
     for row in rows:
         for e in row.entries:
             e.notes = [numbers[i] for i in e.notes]
-    return Grid(filled.table.name, title, heads, columns, rows, {numbers[i]: text for i, text in sorted(filled.used.items())})
+    notes = {numbers[i]: text for i, text in sorted(filled.used.items())}
+    return Grid(filled.table.name, title + preset_of(filled.results), heads, columns, rows, notes)
 
 
 def _metric_rows(f: Filled, metric: str, objects: Sequence[str]) -> Iterator[Row]:

@@ -4,7 +4,7 @@ name: paris                        # result folder runs/bench/<name> unless out 
 tables: [main_result]              # tables of the paper to fill (names of p2gs/bench/data/published/*.csv)
 root: data                         # the tree that holds the objects' folders; --root DIR
 objects: [paris]                   # benchmarks, object ids or names of scene folders below root; null: every scene folder
-config: [preset/cpu.yaml]          # laid under every run
+config: [preset/cpu.yaml]          # laid under every run; --preset paper_literal takes that preset instead of the one named here
 settings:                          # name -> what it changes
   full: {}
   no_repel: {config: [ablation/no_repel.yaml]}
@@ -68,6 +68,8 @@ class RayOptions:
 class BenchOptions:
     """Options of a bench beside its settings; see the module. export: formats written between fit and test (meshes are scored).
 
+    preset: taken instead of the presets among ``config``, a name in configs/preset or a file; results go to a folder of their own.
+    num_parts: of the settings that say nothing of it (the literal preset finds no number: gt).
     reuse: a run takes over finished stages of the same object and seed from the settings before it; stages whose config differs are
     run again, so the results are those of independent runs.  processes: runs at once (local).  threads: of one run, default the
     cores divided by the processes.  timeout_minutes: a longer run is stopped and counts as failed.
@@ -79,6 +81,8 @@ class BenchOptions:
     root: str = "."
     objects: Optional[list[str]] = None
     config: list[str] = field(default_factory=lambda: ["preset/cpu.yaml"])
+    preset: Optional[str] = None
+    num_parts: Optional[Union[int, str]] = None
     set: dict[str, Any] = field(default_factory=dict)
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
     export: list[str] = field(default_factory=lambda: ["ply"])
@@ -100,7 +104,26 @@ class BenchOptions:
 
     @property
     def folder(self) -> Path:
-        return Path(self.out) if self.out else Path("runs") / "bench" / self.name
+        name = self.name if self.preset is None else f"{self.name}_{Path(self.preset).stem}"
+        return Path(self.out) if self.out else Path("runs") / "bench" / name
+
+    @property
+    def base(self) -> list[str]:
+        """The config files below every setting."""
+        if self.preset is None:
+            return self.config
+        chosen = self.preset if "/" in self.preset or self.preset.endswith(".yaml") else f"preset/{self.preset}.yaml"
+        return [chosen, *(name for name in self.config if not is_preset(name))]
+
+    @property
+    def presets(self) -> list[str]:
+        """Names of the presets in use: what a table was made with."""
+        return [Path(name).stem for name in self.base if is_preset(name) or name == self.preset]
+
+
+def is_preset(name: str) -> bool:
+    """Whether a config file is one of configs/preset."""
+    return Path(name).parent.name == "preset"
 
 
 @dataclass(frozen=True)
@@ -155,7 +178,7 @@ class Bench:
         for name, setting in self.settings.items():
             merged = self._merged(setting)
             for scene in self.scenes:
-                parts = resolve_parts(setting.num_parts, scene)
+                parts = resolve_parts(self.parts_of(setting), scene)
                 for seed in o.seeds:
                     decides = [merged, o.set, setting.set, parts, scene.name, scene.format, scene.source, seed, o.export]
                     key = hashlib.sha256(json.dumps(decides, sort_keys=True, default=str).encode()).hexdigest()[:16]
@@ -185,7 +208,11 @@ class Bench:
         return tree
 
     def files(self, setting: Setting) -> list[str]:
-        return [*self.options.config, *setting.config]
+        return [*self.options.base, *setting.config]
+
+    def parts_of(self, setting: Setting) -> Optional[Union[int, str]]:
+        """The setting's number of parts, or else the bench's."""
+        return self.options.num_parts if setting.num_parts is None else setting.num_parts
 
     def words(self, setting: Setting, scene: Scene, seed: int) -> tuple[str, ...]:
         """The words of ``p2gs fit``."""
@@ -198,7 +225,7 @@ class Bench:
         if scene.source is not None:
             words += ["--data.source", scene.source]
         words += ["--seed", str(seed)]
-        parts = resolve_parts(setting.num_parts, scene)
+        parts = resolve_parts(self.parts_of(setting), scene)
         if parts is not None:
             words += ["--num_parts", parts]
         for key, value in {**self.options.set, **setting.set}.items():

@@ -84,3 +84,25 @@ def draw(axis, grid: Grid, metric: str) -> None:
         axis.set_ylim(bottom=base)
     axis.set_title(METRICS[metric].title + (" (higher is better)" if METRICS[metric].higher_is_better else ""), fontsize=10)
     axis.set_xticks(range(len(objects)), objects, rotation=30, ha="right", fontsize=8)
+
+
+def lines(path: Path, series: dict[str, dict[float, float]], x: str, y: str, mark: float) -> bool:
+    """One line a name through {x: y}, y logarithmic, with a dashed line at ``mark``. False where matplotlib is not installed."""
+    try:
+        import matplotlib
+    except ImportError:
+        return False
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(6.5, 4.2), layout="constrained")
+    for (name, points), colour in zip(series.items(), COLOURS["ours"] * len(series), strict=False):
+        axis.plot(list(points), [max(v, 1e-3) for v in points.values()], "o-", color=colour, label=name)
+    axis.axhline(mark, color="#5c6575", linestyle="--", linewidth=0.8)
+    axis.set_yscale("log")
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+    axis.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return True

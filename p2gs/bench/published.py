@@ -38,6 +38,8 @@ METRICS = {
         Metric("lpips", "LPIPS", 3),
         Metric("minutes", "Time (min)", 1),
         Metric("penetration", "Penetration", 3),
+        Metric("extra", "Parts too many", 1),
+        Metric("spare", "Gaussians in spare slots (%)", 1),
     )
 }
 CHAMFER = ("cd_static", "cd_movable", "cd_whole")

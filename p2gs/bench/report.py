@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Iterator, Optional
 
 from p2gs.bench import plots, write
-from p2gs.bench.grids import Entry, Grid, Row, fill, mark_best, summarize
+from p2gs.bench.grids import Entry, Grid, Row, fill, mark_best, preset_of, summarize
 from p2gs.bench.published import CHAMFER, METRICS, PaperTable, paper_table
 from p2gs.bench.results import Results, collect
+from p2gs.bench.significance import PAIRS, published_section
 from p2gs.bench.stats import Comparison, Sample, printed, sample, welch
 from p2gs.types import UserError
 
-GENERIC = ("ang", "pos", "motion", *CHAMFER, "psnr", "ssim", "penetration", "minutes")
+GENERIC = ("ang", "pos", "motion", *CHAMFER, "psnr", "ssim", "lpips", "penetration", "extra", "spare", "minutes")
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ def write_tables(folder: Path | str, names: Optional[list[str]] = None, out: Opt
     for table in tables:
         tests += [*against_paper(table, results), *between_settings(table, results)]
     files += [write_runs(target / "runs.csv", results), write_tests(target / "tests.csv", tests)]
-    page = "\n".join([head(results), *sections, significance(tests), notes(results, any(p.suffix == ".png" for p in files))])
+    published = [published_section()] if set(PAIRS) & {t.name for t in tables} else []
+    page = "\n".join([head(results), *sections, significance(tests), *published, notes(results, any(p.suffix == ".png" for p in files))])
     return [save(target / "index.md", page), *files]
 
 
@@ -85,7 +87,8 @@ def summary(results: Results) -> Grid:
         if any(floors.values()):
             rows.append(Row([column, "sampling floor"], [Entry(m, column, s.mean if (s := floors[m]) else None) for m in metrics], "floor"))
     mark_best(rows)
-    return Grid("summary", f"{results.name}: all runs", ["Object", "Setting"], [METRICS[m].title for m in metrics], rows)
+    title = f"{results.name}: all runs{preset_of(results)}"
+    return Grid("summary", title, ["Object", "Setting"], [METRICS[m].title for m in metrics], rows)
 
 
 # -- tests -------------------------------------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ class Run:
 
 @dataclass
 class Results:
-    """All runs of a bench folder. tables: those the bench names.  about: version, commit and command it was run by."""
+    """All runs of a bench folder. tables: those the bench names.  about: version, commit and command it was run by, and the presets."""
 
     name: str
     runs: list[Run]
@@ -55,7 +55,13 @@ def collect(folder: Path | str) -> Results:
     scenes = {s["name"]: s for s in about["scenes"]}
     runs = [read_run(folder / c["run"], c, scenes[c["object"]]) for c in about["cells"]]
     settings = list(dict.fromkeys(c["setting"] for c in about["cells"]))
-    return Results(about["name"], runs, about["tables"], settings, [s["column"] for s in about["scenes"]], about.get("p2gs") or {})
+    return Results(about["name"], runs, about["tables"], settings, [s["column"] for s in about["scenes"]], made_by(about))
+
+
+def made_by(about: dict) -> dict:
+    """Version, commit and presets of a bench, as text by name."""
+    presets = about.get("presets")
+    return {**(about.get("p2gs") or {}), **({"preset": " + ".join(presets)} if presets else {})}
 
 
 def read_run(folder: Path, cell: dict, scene: dict) -> Run:
@@ -95,6 +101,11 @@ def read_metrics(run: Run, metrics: dict) -> None:
         run.failed["cd_movable"] = (chamfer["failures"], len(chamfer["parts"]))
     views = (metrics.get("views") or {}).get("mean") or {}
     run.values |= {name: views.get(key) for name, key in (("psnr", "psnr_white"), ("ssim", "ssim_white"), ("lpips", "lpips"))}
+    if joints:
+        run.values["extra"] = float(len(joints["extra"]))
+    slots = metrics.get("slots")
+    if slots and any(s["spare"] for s in slots):
+        run.values["spare"] = 100 * sum(s["share"] for s in slots if s["spare"])
     penetration = metrics.get("penetration")
     if penetration:
         run.values["penetration"] = penetration["mean"]

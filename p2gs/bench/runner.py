@@ -78,7 +78,8 @@ def save_bench(bench: Bench) -> None:
     (folder / "bench.yaml").write_text(to_yaml({**bench.tree, "out": str(folder)}), encoding="utf-8")
     cells = [{"object": c.object, "setting": c.setting, "seed": c.seed, "run": str(Path(c.run).relative_to(folder))} for c in bench.cells]
     scenes = [{"name": s.name, "column": s.column, "parts": s.parts} for s in bench.scenes]
-    about = {"p2gs": provenance(), "name": bench.options.name, "tables": bench.options.tables, "scenes": scenes, "cells": cells}
+    o = bench.options
+    about = {"p2gs": provenance(), "presets": o.presets, "name": o.name, "tables": o.tables, "scenes": scenes, "cells": cells}
     (folder / "cells.json").write_text(json.dumps(about, indent=1) + "\n")
 
 

@@ -18,7 +18,7 @@ def bench(args: argparse.Namespace, words: list[str]) -> int:
         raise UserError("bench needs a file: p2gs bench -c bench/paris.yaml --root DIR (or: p2gs bench kernels)")
     from p2gs.bench.plan import read_bench
 
-    for name in ("root", "out", "executor", "processes"):
+    for name in ("root", "out", "preset", "num_parts", "executor", "processes"):
         if getattr(args, name) is not None:
             words = [*words, f"--{name}", getattr(args, name)]
     if args.seeds:

@@ -6,12 +6,14 @@
     parts        [{id, gaussians}]
     joints       {joints: [{gt, type, pred, pred_type, errors: {axis_angle, axis_position, motion} | null}], failures, extra, ...means}:
                  see metrics.joints.JointReport (axis_angle degrees, axis_position x10, motion degrees or length)
-    views        {start, end, mean}: {split, count, psnr_white, psnr_black, ssim_white, ssim_black, psnr_masked, alpha_error,
+    views        {start, end, mean}: {split, count, psnr_white, psnr_black, ssim_white, ssim_black, psnr_masked, lpips (over white;
+                 only with torchvision and its AlexNet weights at hand, see metrics.lpips), alpha_error,
                  depth_median, depth_p90, depth_bad}: photographs that the fit did not train on where there are any; psnr_masked over
                  the object's pixels only, alpha_error mean |alpha - mask|, depth_* of |expected depth - true| on the object,
                  depth_bad the fraction off by more than 1 % of the object's diagonal
     chamfer      {static|movable|whole: {value, floor}, parts, failures}: x1000, see metrics.chamfer.ChamferReport
     penetration  {mean, max}: fraction of the moving Gaussians inside the base, over five states
+    slots        with exact_parts: what became of every part slot, see models.slots.slot_report
     seconds      time the evaluation took
     missing      sentences
 """
@@ -25,12 +27,15 @@ from typing import TYPE_CHECKING, Optional
 
 import numpy as np
 
-from p2gs.export.mesh import read_meshes
+from p2gs.export.mesh import read_mesh, read_meshes
 from p2gs.export.paint import draw, rasterizer_of
 from p2gs.export.pose import pose
+from p2gs.export.protocol import surface_options
 from p2gs.export.twin_json import load_twin
 from p2gs.export.views import bounds
 from p2gs.metrics.joints import evaluate_joints
+from p2gs.metrics.lpips import lpips, why_absent
+from p2gs.metrics.lpips import wanted as lpips_wanted
 from p2gs.metrics.penetration import evaluate_penetration
 from p2gs.ops.ssim import psnr, ssim
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError, View
@@ -65,6 +70,8 @@ def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict
     with rasterizer_of(run_dir):
         metrics["views"] = view_scores(obj, scene, missing)
     metrics["penetration"] = evaluate_penetration(obj)
+    if (run_dir / "slots.json").is_file():
+        metrics["slots"] = json.loads((run_dir / "slots.json").read_text())
     metrics["seconds"] = round(time.perf_counter() - began, 2)
     metrics["missing"] = missing
     path = run_dir / "metrics.json"
@@ -104,6 +111,8 @@ def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]
         gaussians = pose(obj, float(state))
         rows = [one_view(gaussians, view, diagonal) for view in views]
         out[name] = {"split": split, "count": len(rows)} | _means(rows)
+    if out and lpips_wanted() and why_absent() is not None:
+        missing.append(why_absent())
     if out and not any("depth_median" in s for s in out.values()):
         missing.append("the scene has no depth maps")
     both = [{k: v for k, v in s.items() if k not in ("split", "count")} for s in out.values()]
@@ -121,6 +130,9 @@ def one_view(gaussians, view: View, diagonal: float) -> dict[str, float]:
     white, photo_white = (out.colour + (1 - out.alpha)[..., None]).clamp(0, 1), photo + (1 - mask)[..., None]
     row = {"psnr_white": float(psnr(white, photo_white)), "psnr_black": float(psnr(black, photo))}
     row |= {"ssim_white": float(ssim(white, photo_white)), "ssim_black": float(ssim(black, photo))}
+    perceived = lpips(white, photo_white)
+    if perceived is not None:
+        row["lpips"] = perceived
     inside = mask > 0.5
     if inside.any():
         row["psnr_masked"] = float(psnr(white[inside], photo_white[inside]))
@@ -147,7 +159,8 @@ def surface_scores(run_dir: Path, truth: "GroundTruth", assignment: dict[int, in
         if true.static is None or not true.dynamic:
             missing.append(f"the ground truth has no meshes of the {name} state's parts")
             return None
-        pred[name] = PartMeshes(made[0], made[1:])
+        whole_apart = surface_options(run_dir).whole == "separate"
+        pred[name] = PartMeshes(made[0], made[1:], read_mesh(Path(run_dir) / "meshes" / name / "whole.ply") if whole_apart else None)
         whole = None if true.whole is None else _load(true.whole)
         gt[name] = PartMeshes(_load(true.static), [_load(p) for p in true.dynamic], whole)
     return evaluate_chamfer(pred, gt, assignment).to_dict()

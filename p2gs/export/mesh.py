@@ -11,6 +11,7 @@ import torch
 
 from p2gs.export.paint import rasterizer_of
 from p2gs.export.pieces import join_pieces
+from p2gs.export.protocol import largest_clusters, separate_whole, surface_options
 from p2gs.export.sightings import RESOLUTION, TRUNCATION, sight, start_motion
 from p2gs.export.trays import clear_way, complete_tray, not_the_trays
 from p2gs.export.tsdf import Mesh
@@ -35,15 +36,20 @@ def mesh_cameras(obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: 
     return out
 
 
-def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> list[Mesh]:
+def part_meshes(
+    obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION, complete: bool = True
+) -> list[Mesh]:
     """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.  The base's
     underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``), with nothing of
     the base left in their way (``clear_way``) or of other parts on them (``not_the_trays``), and pieces of what slides joined
     (``join_pieces``).
 
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
+    complete: off, there is only what was seen.
     """
     seen = sight(obj, cameras, resolution)
+    if not complete:
+        return [seen.surface(k) for k in range(len(obj.parts))]
     voxel = seen.voxel
     meshes = []
     for k, part in enumerate(obj.parts):
@@ -70,13 +76,18 @@ def part_meshes(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], r
 def write_meshes(run_dir: Path | str, resolution: int = RESOLUTION, log=None) -> dict[str, list[Path]]:
     """RUN/meshes/{start,end}/{part_<id>,whole}.ply with vertex colours, input coordinates. Returns the paths by state.
 
-    The whole is its parts joined, so that it has the surfaces that only the other state shows. Raises UserError without a twin.
+    The whole is its parts joined, so that it has the surfaces that only the other state shows, unless RUN/config.yaml wants another
+    protocol (``protocol.SurfaceOptions``). Raises UserError without a twin.
     """
     run_dir = Path(run_dir)
     began = time.perf_counter()
-    obj = load_twin(run_dir)
+    obj, options = load_twin(run_dir), surface_options(run_dir)
+    if options.cluster > 0:
+        obj = largest_clusters(obj, options.cluster)
     with rasterizer_of(run_dir):
-        meshes = part_meshes(obj, mesh_cameras(obj, read_cameras(run_dir / "cameras.json")), resolution)
+        cameras = mesh_cameras(obj, read_cameras(run_dir / "cameras.json"))
+        meshes = part_meshes(obj, cameras, resolution, options.complete)
+        wholes = [separate_whole(obj, cameras, t, resolution) for t in (0, 1)] if options.whole == "separate" else None
     if not any(len(m.faces) for m in meshes):
         raise UserError(f"{run_dir}: the twin shows no surface from any of its cameras, so there is nothing to mesh")
     written: dict[str, list[Path]] = {}
@@ -87,7 +98,7 @@ def write_meshes(run_dir: Path | str, resolution: int = RESOLUTION, log=None) ->
         written[state] = []
         for part, mesh in zip(obj.parts, moved, strict=True):
             written[state].append(write_mesh(folder / f"part_{part.id}.ply", mesh))
-        written[state].append(write_mesh(folder / "whole.ply", Mesh.join(moved)))
+        written[state].append(write_mesh(folder / "whole.ply", Mesh.join(moved) if wholes is None else wholes[t]))
     if log is not None:
         log(f"meshes: {sum(len(m.faces) for m in meshes):,} triangles in {time.perf_counter() - began:.1f} s")
     return written

@@ -143,10 +143,10 @@ def score_section(metrics: Optional[dict]) -> str:
     views = metrics.get("views") or {}
     if views:
         depth = any("depth_median" in v for v in views.values())
-        keys = ["psnr_white", "psnr_black", "ssim_white", "psnr_masked"] + (["depth_median", "depth_p90"] if depth else [])
-        head = ["state", "views", "PSNR on white", "on black", "SSIM", "PSNR of the object"] + (
-            ["depth error, median", "90 %"] if depth else []
-        )
+        columns = {"psnr_white": "PSNR on white", "psnr_black": "on black", "ssim_white": "SSIM", "psnr_masked": "PSNR of the object"}
+        columns |= {"lpips": "LPIPS"} if any("lpips" in v for v in views.values()) else {}
+        columns |= {"depth_median": "depth error, median", "depth_p90": "90 %"} if depth else {}
+        keys, head = list(columns), ["state", "views", *columns.values()]
         rows = [[k, f"{v['count']} {v['split']}" if "count" in v else "", *(_number(v.get(n)) for n in keys)] for k, v in views.items()]
         out.append(table(head, rows))
     chamfer = metrics.get("chamfer")

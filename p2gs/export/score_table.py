@@ -47,9 +47,12 @@ def view_table(views: Optional[dict]) -> Any:
     if not views:
         return None
     depth = any("depth_median" in v for v in views.values())
-    table = _table("views", "", "PSNR white", "PSNR black", "SSIM white", "PSNR object", *(["depth median", "depth p90"] if depth else []))
+    perceived = any("lpips" in v for v in views.values())
+    more = (["LPIPS"] if perceived else []) + (["depth median", "depth p90"] if depth else [])
+    table = _table("views", "", "PSNR white", "PSNR black", "SSIM white", "PSNR object", *more)
     for name, v in views.items():
         cells = [_num(v.get(k), 2) for k in ("psnr_white", "psnr_black")] + [_num(v.get("ssim_white")), _num(v.get("psnr_masked"), 2)]
+        cells += [_num(v.get("lpips"))] if perceived else []
         cells += [_num(v.get(k), 4) for k in ("depth_median", "depth_p90")] if depth else []
         table.add_row(name, f"{v['count']} {v['split']}" if "count" in v else "", *cells)
     return table

@@ -96,10 +96,13 @@ class Art(Loss):
     over the movable parts; summed with reduce "sum"). F is the repel force at the moved centre (eq. repel, repel_clamped),
     differentiable, for movable parts, and only inside this residual: the optimum mu_hat - F lies away from the repel points.
 
-    variant: "local" takes the expectation of the squared residual over the soft membership, and for F the mean over the repel
-    points within ``radius``, clipped at ``tau_max`` (fractions of the extent) and annealed to nothing at ``anneal`` (fraction of the
-    phase): a force that stays leaves the joint off by tau_max. "paper" blends positions by membership (appendix, "Part Assignment
-    Details") and sums F over all repel points, clipped, to the end; with k_r = 5e-4 and 2,000 points it is at its clip everywhere.
+    variant: "local" takes the expectation of the squared residual over the soft membership, and for F the sum over the repel
+    points within ``radius`` of strength tau_max (radius / d)^(exponent - 1) towards each, clipped at ``tau_max`` (radius and tau_max:
+    fractions of the extent) and annealed to nothing at ``anneal`` (fraction of the phase): a force that stays leaves the joint off by
+    tau_max. Distances in radii keep it below the clip for any exponent, so that exponent and count of the points act. "paper" blends
+    positions by membership (appendix, "Part Assignment Details") and sums F over all repel points, clipped, to the end; with
+    k_r = 5e-4 and 2,000 points it is at its clip everywhere.
+    strength: share of tau_max that one point at the radius exerts; 0.005 keeps the median force at 0.1 to 0.5 tau_max.
     source: "observed", or "canonical" to move the Gaussians' canonical centres to state 1 instead of mu0 (they get gradients).
     sign: "paper", or "away" to turn F around (then the optimum is nearer to the repel points).  k_r = 0 switches F off.
     min_prob: memberships below it feel no force (saves most of the work).  reduce, sample, robust: as in ``vector``.
@@ -111,6 +114,7 @@ class Art(Loss):
     source: Literal["observed", "canonical"] = "observed"
     lambda_rot: float = 0.1
     k_r: float = 5e-4
+    strength: float = 0.005
     exponent: float = 3.0
     eps: float = 1e-5
     radius: float = 0.05
@@ -130,11 +134,12 @@ class Art(Loss):
             moved = carried(parts.transforms, pairs.mu0)
         else:
             moved = carried(parts.at(1.0), parts.means_canonical.index_select(0, pairs.index))
-        tau = self.tau(inputs)
+        tau = self.tau(parts.extent, inputs.step, inputs.total_steps)
         if self.variant == "paper":
             blended = (pairs.probs.T[:, None] * moved).sum(0).T
             movable = 1 - pairs.probs[:, :1]
-            per_pair = squared(blended + movable * self.force(blended, parts, tau) - pairs.mu1, self.robust, parts.extent)
+            force = self.force(blended, parts.repel_points, parts.extent, tau)
+            per_pair = squared(blended + movable * force - pairs.mu1, self.robust, parts.extent)
         else:
             cost = squared(self.push(moved, pairs.probs, parts, tau) - pairs.mu1.T, self.robust, parts.extent, dim=1)
             per_pair = (pairs.probs.T * cost).sum(0)
@@ -144,27 +149,24 @@ class Art(Loss):
             total = total + self.lambda_rot * (angle.mean() if self.reduce == "mean" else angle.sum())
         return total
 
-    def tau(self, inputs: LossInputs) -> float:
+    def tau(self, extent: float, step: int, total_steps: int) -> float:
         """The force's largest length now, in scene units."""
-        tau = self.tau_max * inputs.parts.extent
+        tau = self.tau_max * extent
         if self.variant == "paper" or self.anneal <= 0:
             return tau
-        return tau * max(0.0, 1 - inputs.step / max(inputs.total_steps, 1) / self.anneal)
+        return tau * max(0.0, 1 - step / max(total_steps, 1) / self.anneal)
 
-    def force(self, points: Tensor, parts: PartState, tau: float) -> Tensor:
-        if parts.repel_points is None or self.k_r == 0 or tau <= 0:
+    def force(self, points: Tensor, repel_points: Tensor | None, extent: float, tau: float) -> Tensor:
+        """F [N, 3] at points [N, 3] from repel_points [R, 3], at most ``tau`` long, all in scene units."""
+        if repel_points is None or len(repel_points) == 0 or self.k_r == 0 or tau <= 0:
             return torch.zeros_like(points)
-        reduce = "sum" if self.variant == "paper" else "local"
-        force = repel_force(
-            points,
-            parts.repel_points,
-            k_r=self.k_r,
-            exponent=self.exponent,
-            eps=self.eps,
-            reduce=reduce,
-            tau_max=tau,
-            radius=self.radius * parts.extent,
-        )
+        law = {"exponent": self.exponent, "eps": self.eps, "tau_max": tau}
+        if self.variant == "paper":
+            force = repel_force(points, repel_points, k_r=self.k_r, reduce="sum", **law)
+        else:
+            radius = self.radius * extent
+            unit = self.strength * self.tau_max * extent * radius ** (self.exponent - 1)
+            force = repel_force(points, repel_points, k_r=unit, reduce="within", radius=radius, **law)
         return force if self.sign == "paper" else -force
 
     def push(self, moved: Tensor, probs: Tensor, parts: PartState, tau: float) -> Tensor:
@@ -175,5 +177,5 @@ class Art(Loss):
         feels[0] = False
         (chosen,) = feels.flatten().nonzero(as_tuple=True)
         flat = moved.transpose(0, 1).flatten(1)
-        force = self.force(flat.index_select(1, chosen).T, parts, tau)
+        force = self.force(flat.index_select(1, chosen).T, parts.repel_points, parts.extent, tau)
         return flat.scatter_add(1, chosen.expand(3, -1), force.T).unflatten(1, feels.shape).transpose(0, 1)

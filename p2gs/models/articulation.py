@@ -17,10 +17,11 @@ from p2gs.models.part_head import PartHead, random_embeddings
 from p2gs.models.phase import exponential, register_phase
 from p2gs.models.repel import place_repel_points
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
+from p2gs.models.slots import add_spare
 from p2gs.models.splats import Splats
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
-from p2gs.types import GaussianTensors
+from p2gs.types import GaussianTensors, UserError
 
 IMAGE_LOSSES = ("render", "alpha", "depth", "depth_variance", "planar", "opacity")  # they look at no part state, which costs time to make
 
@@ -28,13 +29,16 @@ IMAGE_LOSSES = ("render", "alpha", "depth", "depth_variance", "planar", "opacity
 @dataclass
 class RepelConfig:
     """Repel points (paper section 4.3, appendix). count: N_R.  threshold: how near to the static base a movable part must be,
-    by ``threshold_mode`` ("relative" to the box diagonal, "absolute", or in "spacing"s).  noise: standard deviation of their
-    first placement, relative to the diagonal. The callback ``repel`` places them anew, without noise (the dynamic variant)."""
+    by ``threshold_mode`` ("relative" to the box diagonal, "absolute", or in "spacing"s).  noise: length of an offset at their
+    first placement, relative to the diagonal. The callback ``repel`` places them anew, without noise (the dynamic variant).
+    render: their force, as the loss ``art`` has it, moves the Gaussians in what training draws (paper appendix, "Part Assignment
+    Details"), never in what is predicted or handed over."""
 
     count: int = 2000
     threshold: float = 0.05
     threshold_mode: Literal["relative", "absolute", "spacing"] = "relative"
     noise: float = 0.0
+    render: bool = False
 
 
 @dataclass
@@ -42,7 +46,8 @@ class ArticulationConfig(ImageConfig):
     """Options of the articulation phase.
 
     init: "discovery" starts psi, f and xi from the discovered parts; "identity" and "random" (the paper's own) learn from nothing.
-    embedding_dim: of psi.  temperature .. temperature_end: softmax temperature, falling geometrically until ``harden_until``
+    psi: "init" begins as ``init`` says; "random" begins psi at random wherever the screws come from: nothing of the discovered labels
+    is used.  embedding_dim: of psi.  temperature .. temperature_end: softmax temperature, falling geometrically until ``harden_until``
     (fraction of the phase); the paper's letter is 1 throughout.  rate_screws: paper 1e-3.  screws_from: fraction of the phase
     at which screws begin to learn.  neighbours, refresh: k of the neighbourhood KL, and steps between kNN and pair refreshes.
     pair_target: "matched" holds the pairs of the fusion; "nearest" renews the observed centres by nearest neighbours in each state
@@ -53,6 +58,7 @@ class ArticulationConfig(ImageConfig):
     levels: list[int] = field(default_factory=lambda: [400])
     level_starts: list[float] = field(default_factory=lambda: [0.0])
     init: Literal["discovery", "identity", "random"] = "discovery"
+    psi: Literal["init", "random"] = "init"
     embedding_dim: int = 16
     sureness: float = 4.0
     temperature: float = 1.0
@@ -69,6 +75,22 @@ class ArticulationConfig(ImageConfig):
     pair_target: Literal["matched", "nearest"] = "nearest"
     nearest_from: float = 0.2
     repel: RepelConfig = field(default_factory=RepelConfig)
+
+
+NEED_PAIRS = ("art", "velocity", "vector")  # they look at observed pairs and vanish without
+
+
+def check_losses(config: ArticulationConfig, losses: dict[str, Loss], canonical: CanonicalGaussians) -> None:
+    """Raises UserError where losses that are switched on would be nothing, without a word."""
+    vanish = [name for name in NEED_PAIRS if name in losses and losses[name].weight != 0]
+    late = config.pair_target != "nearest" or config.nearest_from > 0
+    if vanish and late and not bool(canonical.paired.any()):
+        raise UserError(
+            f"phases.articulation.losses: {', '.join(vanish)} need observed pairs, and fusion has made none; "
+            "switch them off (null), or take nearest neighbours throughout (pair_target: nearest, nearest_from: 0.0)"
+        )
+    if config.repel.render and "art" not in losses:
+        raise UserError("phases.articulation.repel.render: draws the force of losses.art, which is switched off; expected render: false")
 
 
 @register_phase("articulation")
@@ -93,23 +115,27 @@ class ArticulationPhase(ImagePhase):
         generator = self.generator(0, 3)
         self.states = [s.gaussians.means[torch.sigmoid(s.gaussians.opacity_logits) > 0.5] for s in states]
         self.extent = extent
+        check_losses(config, losses, canonical)
+        labels = canonical.labels
         if config.init == "discovery":
-            self.types, transforms, self.confidence = list(motions.types), motions.transforms, motions.confidence
+            labels, transforms = add_spare(labels, motions.transforms, num_parts - 1 - len(motions), self.generator(0, 6))
+            spare = len(transforms) - len(motions)
+            self.types, self.confidence = [*motions.types, *["free"] * spare], torch.cat([motions.confidence, torch.zeros(spare)])
         else:
             transforms = initial_screws(config.init, num_parts, generator)
             self.types, self.confidence = ["free"] * len(transforms), torch.zeros(len(transforms))
         parts = 1 + len(transforms)
         self.head = PartHead(config.embedding_dim, parts, generator)
-        if config.init == "discovery":
+        if config.init == "discovery" and config.psi == "init":
             sure = config.sureness * (0.25 + 0.75 * (canonical.margin / canonical.margin.median().clamp_min(1e-6)).clamp(0, 1))
-            psi = self.head.embed(canonical.labels, sure)
+            psi = self.head.embed(labels, sure)
         else:
             psi = random_embeddings(len(canonical.gaussians), config.embedding_dim, generator)
         carried = {"paired": canonical.paired, "mu0": canonical.mu0, "mu1": canonical.mu1}
         self.splats = Splats(canonical.gaussians, extra={"psi": psi}, carried=carried)
         self._pairs: ObservedPairs | None = None
         self.screws = PartScrews(transforms)
-        betas = canonical.betas if len(canonical.betas) == parts else canonical.betas[:1].expand(parts)
+        betas = torch.cat([canonical.betas, canonical.betas[:1].expand(max(parts - len(canonical.betas), 0))])
         self.register_buffer("times", (1.0 - betas).float().contiguous())
         self.register_buffer("repel_points", torch.zeros(0, 3))
         # the neighbourhood graph is state: a resumed run must use the one of the last refresh
@@ -141,10 +167,18 @@ class ArticulationPhase(ImagePhase):
         camera, target = self.target(step // 2, state)
         g = self.splats.tensors()
         probs = self.head(self.splats.psi, self.temperature(step))
-        render = self.render(blend_move(g, probs, self.screws.twists(state - self.times)), camera, target.background)
+        moved = blend_move(g, probs, self.screws.twists(state - self.times))
+        if self.config.repel.render:
+            moved = moved.placed(moved.means + (1 - probs[:, :1]) * self.repel_force(moved.means, step), moved.quats)
+        render = self.render(moved, camera, target.background)
         self.refresh(step, g, probs)
         due = any(loss.active(step, self.total_steps) for name, loss in self.losses.items() if name not in IMAGE_LOSSES)
         return LossInputs(step, self.total_steps, g, render, target, camera, self.part_state(g, probs) if due else None, self.loss_cache)
+
+    def repel_force(self, points: Tensor, step: int) -> Tensor:
+        """The force of the loss ``art`` at points [N, 3] of any state (the repel points lie on the base, which does not move)."""
+        art = self.losses["art"]
+        return art.force(points, self.repel_points, self.extent, art.tau(self.extent, step, self.total_steps))
 
     def refresh(self, step: int, g: GaussianTensors, probs: Tensor) -> None:
         """Renew neighbours and observed pairs every ``refresh`` steps."""

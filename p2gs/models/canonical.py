@@ -9,23 +9,32 @@ import torch
 from torch import Tensor
 
 from p2gs.models.handover import CanonicalGaussians, PartMotions
+from p2gs.models.matching import beta_weight, farthest_points, hungarian_pairs, motion_clusters, motion_richness
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors, UserError
+
+__all__ = [
+    "CanonicalConfig", "beta_weight", "blend", "carry", "farthest_points", "fuse", "hungarian_pairs", "motion_richness", "with_static",
+]  # fmt: skip
 
 
 @dataclass
 class CanonicalConfig:
     """How two single-state reconstructions become one.
 
-    beta: "global" (paper Eq. for beta from motion richness), "uniform" (0.5) or "per_part" (each part its own D; ablation).
+    beta: "global" (paper Eq. for beta from motion richness), "uniform" (0.5) or "per_part" (each part its own D; ablation; where no parts
+    are known, ``motion_clusters`` of the pairs stand for them).
     correspondence: "motion" carries both states to canonical time by the discovered motions before matching; "hungarian" is the
     paper's letter: raw centres are matched and a pair is joined by a chord. match_size: farthest points per state that are matched.
+    match_smaller: "farthest" cuts both states to ``match_size``; "whole" keeps all of the smaller state (the paper names no cut; both
+    uncut, 100,000 Gaussians a state make a matrix of 80 GB).
     fusion: "union" keeps the Gaussians of the motion-rich state and adds what only the other state saw; "paper" replaces matched
     Gaussians by beta-weighted averages of all parameters and keeps unmatched ones by ``unmatched``: "static" (those of the
     motion-rich state that did not move), "none" or "all". "none" is the ablation without canonical initialisation: the start
     state's Gaussians as they are, at canonical time 0, with no observed pairs.
-    min_opacity: fainter Gaussians take no part in D and matching.  trim: fraction of the largest distances left out of D (floaters).
+    min_opacity: fainter Gaussians take no part in D and matching (0 = all do).  trim: fraction of the largest distances left out of D
+    (floaters).
     free_space: tolerance (internal units) of the test that drops or relabels what the other state's cameras see through; 0 = off.
     hidden: what only the poorer state saw is kept where this share of the richer state's views has something in front of it; elsewhere
     the richer state shows what there is (0 = all is kept; needs free_space).
@@ -34,6 +43,7 @@ class CanonicalConfig:
     beta: Literal["global", "uniform", "per_part"] = "global"
     correspondence: Literal["motion", "hungarian"] = "motion"
     match_size: int = 3000
+    match_smaller: Literal["farthest", "whole"] = "farthest"
     fusion: Literal["union", "paper", "none"] = "union"
     unmatched: Literal["static", "none", "all"] = "static"
     min_opacity: float = 0.5
@@ -49,45 +59,6 @@ def keep_rows(c: CanonicalGaussians, labels: Tensor, keep: Tensor) -> CanonicalG
     counted = {**c.diagnostics, "relabelled": int((keep & (labels != c.labels)).sum()), "dropped": int((~keep).sum())}
     kept = (labels[keep], c.margin[keep], paired[keep], c.mu0[keep], c.mu1[keep])
     return CanonicalGaussians(c.gaussians[keep], c.betas, *kept, offsets, counted)
-
-
-def motion_richness(a: Tensor, b: Tensor, trim: float = 0.0) -> float:
-    """D^{a->b} = E_i min_j ||a_i - b_j|| (paper Eq. D, unsquared), the largest ``trim`` of the distances left out. a [N, 3], b [M, 3]."""
-    distance = knn(b, a, 1, False)[0][:, 0]
-    keep = max(int(round(len(distance) * (1 - trim))), 1)
-    return float(distance.sort().values[:keep].mean())
-
-
-def beta_weight(d01: float, d10: float) -> float:
-    """beta = D01 / (D01 + D10); 0.5 when nothing moved."""
-    return d01 / (d01 + d10) if d01 + d10 > 0 else 0.5
-
-
-def farthest_points(points: Tensor, count: int) -> Tensor:
-    """Indices [min(count, N)] of farthest-point sampling, started at the point nearest the mean (deterministic)."""
-    n = len(points)
-    if count >= n:
-        return torch.arange(n)
-    picked = torch.empty(count, dtype=torch.int64)
-    picked[0] = (points - points.mean(0)).square().sum(1).argmin()
-    columns = points.T.contiguous()
-    nearest = torch.full((n,), float("inf"))
-    for i in range(1, count):
-        last = columns[:, picked[i - 1]]
-        distance = (columns[0] - last[0]).square_().add_((columns[1] - last[1]).square_()).add_((columns[2] - last[2]).square_())
-        torch.minimum(nearest, distance, out=nearest)
-        picked[i] = nearest.argmax()
-    return picked
-
-
-def hungarian_pairs(a: Tensor, b: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Match farthest points of a [N, 3] and b [M, 3] by least total distance (paper section 4.1). Returns indices (into a, into b)."""
-    from scipy.optimize import linear_sum_assignment
-
-    count = min(count, len(a), len(b))
-    ia, ib = farthest_points(a, count), farthest_points(b, count)
-    rows, cols = linear_sum_assignment(torch.cdist(a[ia].double(), b[ib].double()).numpy())
-    return ia[torch.as_tensor(rows)], ib[torch.as_tensor(cols)]
 
 
 def carry(g: GaussianTensors, labels: Tensor, transforms: Tensor) -> GaussianTensors:
@@ -124,14 +95,18 @@ def fuse(
     motions: PartMotions | None,
     config: CanonicalConfig,
     hidden: tuple[Tensor, Tensor] | None = None,
+    num_parts: int | None = None,
 ) -> CanonicalGaussians:
     """Two single-state reconstructions -> one canonical field.
 
     hidden: [N] float by state, the share of the other state's views that has something in front of each Gaussian (``hidden_share``).
+    num_parts: K, the static base counted, for ``beta: per_part`` without motions.
     Without motions (or with ``correspondence: hungarian``) a matched pair becomes beta mu0 + (1-beta) mu1 and remembers its chord.
-    Raises UserError when ``beta: per_part`` is asked for without parts.
+    Raises UserError when ``beta: per_part`` is asked for without parts and without their number.
     """
     solid = [torch.sigmoid(g.opacity_logits) > config.min_opacity for g in (g0, g1)]
+    if config.min_opacity <= 0:
+        solid = [torch.ones(len(g), dtype=torch.bool) for g in (g0, g1)]
     p0, p1 = g0.means[solid[0]], g1.means[solid[1]]
     if min(len(p0), len(p1)) < 10:
         raise UserError(
@@ -143,15 +118,15 @@ def fuse(
     d01, d10 = motion_richness(p0, p1, config.trim), motion_richness(p1, p0, config.trim)
     parts = 1 + (len(motions) if motions is not None else 0)
     betas = torch.full((parts,), 0.5 if config.beta == "uniform" else beta_weight(d01, d10), dtype=torch.float64)
-    if config.beta == "per_part":
-        if motions is None:
-            raise UserError("canonical_fusion.beta: per_part needs discovered parts (phases.articulation.init: discovery)")
+    if config.beta == "per_part" and motions is None and num_parts is None:
+        raise UserError("canonical_fusion.beta: per_part needs discovered parts or their number (--num_parts N)")
+    if config.beta == "per_part" and motions is not None:
         for k in range(1, parts):
             a, b = p0[motions.labels[0][solid[0]] == k], p1[motions.labels[1][solid[1]] == k]
             if min(len(a), len(b)) >= 10:
                 betas[k] = beta_weight(motion_richness(a, p1, config.trim), motion_richness(b, p0, config.trim))
     if motions is None or config.correspondence == "hungarian":
-        return _fuse_chords(g0, g1, motions, solid, betas, d01 >= d10, config)
+        return _fuse_chords(g0, g1, motions, solid, betas, d01 >= d10, config, num_parts)
     return _fuse_motions(g0, g1, motions, solid, betas, d01 >= d10, config, hidden)
 
 
@@ -164,15 +139,20 @@ def _start_state_only(g0, motions) -> CanonicalGaussians:
     return _with_pairs(g0, betas, labels, margin, torch.zeros(0, dtype=torch.int64), nothing, nothing)
 
 
-def _fuse_chords(g0, g1, motions, solid, betas, start_is_rich, config) -> CanonicalGaussians:
+def _fuse_chords(g0, g1, motions, solid, betas, start_is_rich, config, num_parts) -> CanonicalGaussians:
     """The paper's letter."""
     s0, s1 = solid[0].nonzero().squeeze(1), solid[1].nonzero().squeeze(1)
-    i, j = hungarian_pairs(g0.means[s0], g1.means[s1], config.match_size)
+    i, j = hungarian_pairs(g0.means[s0], g1.means[s1], config.match_size, config.match_smaller == "whole")
     i, j = s0[i], s1[j]
     labels = margin = None
     if motions is not None:
         labels, margin = motions.labels, motions.margin
-    pairs = blend(g0[i], g1[j], betas[labels[0][i]][:, None] if labels is not None else float(betas[0]))
+        weight = betas[labels[0][i]][:, None]
+    elif config.beta == "per_part":
+        weight = _cluster_betas(g0.means[i], g1.means[j], g0.means[s0], g1.means[s1], num_parts - 1, float(betas[0]), config.trim)[:, None]
+    else:
+        weight = float(betas[0])
+    pairs = blend(g0[i], g1[j], weight)
     rich, other, own, state = (g0, g1, i, 0) if start_is_rich else (g1, g0, j, 1)
     rest = _unmatched(rich, other, own, config)
     kept = rich[rest]
@@ -186,6 +166,17 @@ def _fuse_chords(g0, g1, motions, solid, betas, start_is_rich, config) -> Canoni
     offsets[: len(i), 0] = g0.means[i] - pairs.means
     offsets[: len(i), 1] = g1.means[j] - pairs.means
     return _with_pairs(g, betas, new_labels, new_margin, torch.arange(len(i)), g0.means[i], g1.means[j], offsets)
+
+
+def _cluster_betas(start: Tensor, end: Tensor, all0: Tensor, all1: Tensor, movable: int, rest: float, trim: float) -> Tensor:
+    """beta [M] of each pair: of its motion cluster by the cluster's own D, ``rest`` where it is still. all0, all1 [N, 3]: the states."""
+    cluster = motion_clusters(start, end, movable)
+    betas = torch.full((len(start),), rest, dtype=torch.float64)
+    for k in range(1, movable + 1):
+        rows = cluster == k
+        if int(rows.sum()) >= 10:
+            betas[rows] = beta_weight(motion_richness(start[rows], all1, trim), motion_richness(end[rows], all0, trim))
+    return betas
 
 
 def _unmatched(rich, other, own, config) -> Tensor:
@@ -213,7 +204,7 @@ def _fuse_motions(g0, g1, motions, solid, betas, start_is_rich, config, hidden) 
     T, times = with_static(motions.transforms), 1.0 - betas
     labels, margin = motions.labels, motions.margin
     at = [carry(g, labels[s], se3.screw_at(T, times - s)) for s, g in enumerate((g0, g1))]
-    i, j = _match_parts(at, labels, solid, config.match_size)
+    i, j = _match_parts(at, labels, solid, config)
     rich, poor = (0, 1) if start_is_rich else (1, 0)
     own = (i, j)[rich]
     if config.fusion == "paper":
@@ -236,7 +227,7 @@ def _fuse_motions(g0, g1, motions, solid, betas, start_is_rich, config, hidden) 
     return _with_pairs(g, betas, new_labels, new_margin, index, g0.means[i], g1.means[j])
 
 
-def _match_parts(at, labels, solid, match_size: int) -> tuple[Tensor, Tensor]:
+def _match_parts(at, labels, solid, config) -> tuple[Tensor, Tensor]:
     """Hungarian pairs of the two states at canonical time, each part by itself, so that no pair joins two parts."""
     parts = int(max(int(labels[s].max()) for s in (0, 1))) + 1
     total = max(int(solid[0].sum()), 1)
@@ -245,8 +236,8 @@ def _match_parts(at, labels, solid, match_size: int) -> tuple[Tensor, Tensor]:
         rows = [(solid[s] & (labels[s] == k)).nonzero().squeeze(1) for s in (0, 1)]
         if min(len(rows[0]), len(rows[1])) < 5:
             continue
-        share = max(match_size * len(rows[0]) // total, min(300, match_size))
-        i, j = hungarian_pairs(at[0].means[rows[0]], at[1].means[rows[1]], share)
+        share = max(config.match_size * len(rows[0]) // total, min(300, config.match_size))
+        i, j = hungarian_pairs(at[0].means[rows[0]], at[1].means[rows[1]], share, config.match_smaller == "whole")
         i, j = rows[0][i], rows[1][j]
         gap = (at[0].means[i] - at[1].means[j]).norm(dim=1)
         close = gap <= 3 * gap.median().clamp_min(1e-4)  # a larger gap: seen in one state only

@@ -51,6 +51,7 @@ class CanonicalFusionPhase(ImagePhase):
         views,
         stacks: list[DepthStack] | None = None,
         counted: dict | None = None,
+        num_parts: int | None = None,
         **common,
     ):
         super().__init__(config, losses, views, **common)
@@ -60,7 +61,7 @@ class CanonicalFusionPhase(ImagePhase):
             hidden = tuple(
                 hidden_share(s.gaussians.means, motions.labels[i], away[i], stacks[1 - i], SURFACE) for i, s in enumerate(states)
             )
-        fused = fuse(states[0].gaussians, states[1].gaussians, motions, config.canonical, hidden)
+        fused = fuse(states[0].gaussians, states[1].gaussians, motions, config.canonical, hidden, num_parts)
         if stacks is not None and motions is not None and fused.offsets is None and config.canonical.free_space > 0:
             T, tau = with_static(motions.transforms), config.canonical.free_space
             means = fused.gaussians.means

@@ -12,13 +12,14 @@ from p2gs.ops.so3 import quat_to_matrix
 def densify(
     splats: Splats,
     optimizer: torch.optim.Optimizer,
-    target: int,
+    target: int | None,
     *,
     generator: torch.Generator,
     min_opacity: float = 0.005,
     max_scale: float = 0.1,
     split_scale: float = 0.01,
     max_growth: float = 0.15,
+    threshold: float = 0.0,
 ) -> tuple[int, int]:
     """Prune Gaussians that are faint, huge or in no view since the last call, then grow towards ``target`` by
     copying those with the largest mean screen gradient.
@@ -27,9 +28,13 @@ def densify(
     second is drawn from the first's density; smaller ones are cloned in place with both opacities lowered so that the pair is
     as opaque as the one was. At most ``max_growth`` of the present count is added in one call. Gradient-ranked growth to a
     budget rather than a threshold keeps time and memory predictable.
+    threshold: above 0, every Gaussian grows whose mean screen gradient exceeds it (3DGS's rule; loss per half the image's height, of
+    absolute gradients), and ``target`` (None: nothing) is all that limits their number.
 
-    Returns (added, pruned).
+    Returns (added, pruned). Raises ValueError without both target and threshold.
     """
+    if target is None and threshold <= 0:
+        raise ValueError("densify needs a target or a threshold")
     with torch.no_grad():
         opacity = torch.sigmoid(splats.opacity_logits)
         scale = splats.log_scales.exp().amax(dim=1)
@@ -39,13 +44,15 @@ def densify(
         if not keep.any():
             keep = finite  # an object that is not there yet: prune nothing but garbage
         kept = keep.nonzero().squeeze(1)
-        room = min(target - kept.numel(), int(max_growth * kept.numel()) + 1)
+        room = kept.numel() if target is None else target - kept.numel()
+        if threshold <= 0:
+            room = min(room, int(max_growth * kept.numel()) + 1)
         grown = kept[:0]
         if room > 0:
             score = (splats.grad_sum / splats.seen.clamp_min(1))[kept]
             # stable sort: ties must not depend on the thread count
             order = torch.sort(score, descending=True, stable=True).indices[:room]
-            grown = kept[order[score[order] > 0]]
+            grown = kept[order[score[order] > 2 * threshold]]  # the statistics are per image height, twice the gradient per half of it
         index = torch.cat([kept, grown])
         fresh = torch.zeros(index.numel(), dtype=torch.bool, device=index.device)
         fresh[kept.numel() :] = True
@@ -53,6 +60,15 @@ def densify(
         gather(splats, optimizer, index, fresh)
         _separate(splats, first, torch.arange(kept.numel(), index.numel(), device=index.device), split_scale, generator)
     return grown.numel(), int((~keep).sum())
+
+
+@torch.no_grad()
+def reset_opacity(splats: Splats, optimizer: torch.optim.Optimizer, opacity: float) -> None:
+    """No Gaussian stays more opaque than ``opacity``; the optimiser forgets its moments of opacities (3DGS's reset)."""
+    splats.opacity_logits.data.clamp_(max=float(torch.logit(torch.tensor(opacity))))
+    for key, value in optimizer.state.get(splats.opacity_logits, {}).items():
+        if torch.is_tensor(value) and key != "step":
+            value.zero_()
 
 
 def _separate(splats: Splats, first: Tensor, second: Tensor, split_scale: float, generator: torch.Generator) -> None:

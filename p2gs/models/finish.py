@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Callable, Optional, Sequence
+from typing import Callable, Literal, Optional, Sequence
 
 import torch
 from torch import Tensor
@@ -44,7 +44,10 @@ class FinishConfig:
     the drawer (0 = off). exports: simulator formats written at the end of a fit, with meshes and report (empty:
     neither; `p2gs export` makes them later). extend_range: joint limits go on beyond the observed motion until the part touches another
     one (half a turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians whose majority exceeds the rest
-    by less are shown as such in the diagnosis (0..1).
+    by less are shown as such in the diagnosis (0..1). complete: meshes have guesses for what no camera saw (undersides,
+    drawers' trays, hidden middles). whole: the mesh of the whole is its parts "joined", or a surface of its own, made "separate"ly from
+    each state's views, as PARIS, DTA and ArtGS have it. cluster: for meshes a moving part keeps only its largest DBSCAN cluster of
+    Gaussians, this the radius (input units; 0 = off; ArtGS cleans real scans so, with 0.05).
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0, rim=2.0))
@@ -59,6 +62,9 @@ class FinishConfig:
     exports: list[str] = field(default_factory=lambda: ["urdf", "mjcf", "glb"])
     extend_range: bool = False
     unclear: float = 0.8
+    complete: bool = True
+    whole: Literal["joined", "separate"] = "joined"
+    cluster: float = 0.0
 
 
 @dataclass

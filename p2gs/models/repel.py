@@ -31,7 +31,8 @@ def place_repel_points(
     threshold: a fraction of ``extent`` ("relative"; by default the diagonal of all points' box), a length ("absolute"; the paper
     says 1.5, which takes in every point of an object of the benchmarks' size), or a multiple of the static points' median
     nearest-neighbour distance ("spacing").
-    noise: standard deviation of a Gaussian offset, a length (the paper's sigma_r times the extent). No gradient.
+    noise: length of an offset in a random direction (the paper's sigma_r, "3D offsets with magnitude sigma_r", times the extent). No
+    gradient.
     Raises ValueError for another mode.
     """
     from scipy.spatial import cKDTree
@@ -50,7 +51,8 @@ def place_repel_points(
     chosen = near[torch.randperm(len(near), generator=generator)[:count]]
     points = static[chosen.to(static.device)]
     if noise > 0:
-        points = points + noise * torch.randn(points.shape, generator=generator).to(points)
+        way = torch.randn(points.shape, generator=generator).to(points)
+        points = points + noise * torch.nn.functional.normalize(way, dim=1)
     return points
 
 

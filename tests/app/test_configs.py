@@ -16,7 +16,7 @@ def files(folder: str) -> list[str]:
 
 
 def test_the_folders_are_not_empty():
-    assert {f"preset/{name}.yaml" for name in ("cpu", "gpu", "paper", "paper_literal", "smoke")} <= set(files("preset"))
+    assert {f"preset/{name}.yaml" for name in ("cpu", "gpu", "paper", "paper_depth", "paper_literal", "smoke")} <= set(files("preset"))
     assert {"data/paris.yaml", "data/dta.yaml", "data/artgs.yaml"} <= set(files("data")) and len(files("ablation")) >= 5
 
 
@@ -51,6 +51,44 @@ def test_the_paper_says_these_numbers():
     weights = {name: loss.weight for name, loss in articulation.losses.items()}
     assert weights == {"render": 1.0, "part": 0.1, "art": 1.0, "contact": 0.5, "velocity": 0.5, "vector": 0.5}
     assert articulation.config.rate_screws == 1e-3 and articulation.config.repel.count == 2000
+
+
+def test_the_literal_preset_has_nothing_of_the_default_that_the_paper_has_not():
+    literal = load_config(["preset/paper_literal.yaml"])
+    articulation = literal.phases["articulation"]
+    assert all(loss.every == 1 and loss.start == 0 and loss.end == 1 for loss in articulation.losses.values())
+    assert {name: loss.reduce for name, loss in articulation.losses.items() if hasattr(loss, "reduce")} == {
+        "part": "mean", "art": "sum", "contact": "sum", "velocity": "sum", "vector": "sum"
+    }  # fmt: skip
+    assert all(articulation.losses[n].sample == 0 for n in ("art", "contact", "velocity", "vector"))
+    art = articulation.losses["art"]
+    assert articulation.config.repel.render and art.variant == "paper" and art.lambda_rot == 0.1
+    for name in ("single_state", "canonical_fusion", "articulation"):
+        phase = literal.phases[name]
+        assert len(phase.config.levels) == 1 and not {"alpha", "depth", "depth_variance", "flat", "planar"} & set(phase.losses)
+    densify = literal.phases["single_state"].callbacks["densify"]
+    assert densify.budget is None and densify.threshold > 0 and densify.reset_every == 3000
+    canonical = literal.phases["canonical_fusion"].config.canonical
+    assert canonical.min_opacity == 0 and canonical.trim == 0 and canonical.match_smaller == "whole"
+    finish = literal.phases["finish"].config
+    assert not finish.complete and finish.whole == "separate" and finish.polish.steps == finish.tune.steps == 0
+    assert literal.data_options["normalize"] == "none"
+    with_data = load_config(["preset/paper_literal.yaml", "data/artgs.yaml"], ["--data.root", "x"])
+    assert with_data.data_options["normalize"] == "none" and with_data.data_options["depth"] == "never"
+
+
+def test_depth_is_in_the_depth_preset_alone():
+    paper, depth = load_config(["preset/paper.yaml"]), load_config(["preset/paper_depth.yaml"])
+    trained = ("single_state", "sharpen", "canonical_fusion", "articulation")
+    assert not any("depth" in paper.phases[n].losses for n in trained) and paper.data_options["depth"] == "never"
+    assert all(depth.phases[n].losses["depth"].weight == 1.0 for n in trained) and depth.data_options["depth"] == "always"
+
+
+def test_exact_parts_need_a_number():
+    from p2gs.types import UserError
+
+    with pytest.raises(UserError, match="exact_parts: true needs a number"):
+        load_config(["preset/cpu.yaml"], ["--exact_parts", "true"])
 
 
 def test_the_loss_of_the_readme_is_found_and_switched_on(tmp_path, monkeypatch):

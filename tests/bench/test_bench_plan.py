@@ -121,3 +121,14 @@ def test_every_benchmark_object_is_a_column_of_the_paper():
     assert {o.column for o in (*lists["dta_multi"], *lists["artgs_multi"])} == set(paper_table("complex_main_result").objects)
     for o in (*lists["dta_multi"], *lists["artgs_multi"]):
         assert f"({o.parts} parts)" in o.column, o.id
+
+
+def test_a_bench_takes_another_preset_and_says_which(bench_file, tmp_path):
+    text = "config: [preset/cpu.yaml, preset/../base.yaml]\nsettings: {full: {}, two: {num_parts: 2}}\nseeds: [0]\n"
+    plain, literal = (read_bench([bench_file(text)], words) for words in ((), ("--preset", "paper_literal", "--num_parts", "gt")))
+    assert plain.options.presets == ["cpu"] and literal.options.presets == ["paper_literal"]
+    assert literal.cells[0].words[:4] == ("-c", "preset/paper_literal.yaml", "-c", "preset/../base.yaml")
+    given = {c.setting: c.words[c.words.index("--num_parts") + 1] for c in literal.cells if c.object == "cabinet"}
+    assert given == {"full": "3", "two": "2"} and "--num_parts" not in plain.cells[0].words
+    assert literal.options.folder != plain.options.folder or plain.options.out is not None
+    literal.check_settings()

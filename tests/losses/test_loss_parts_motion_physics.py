@@ -93,15 +93,14 @@ def velocity_naive(p, variant):
     return total / len(p.transforms)
 
 
-def force_naive(x, p, tau, radius=None, k_r=5e-4, eps=1e-5):
-    total, count = [0.0] * 3, 0
+def force_naive(x, p, tau, radius=None, k_r=5e-4, eps=1e-5, strength=0.005):
+    """With a radius every point within it exerts ``strength`` tau_max (radius / d)^2, tau_max 0.01 of the extent; else the paper's sum."""
+    total = [0.0] * 3
     for r in p.repel_points.tolist():
         offset = minus(r, x)
         if radius is None or norm(offset) < radius:
-            count += 1
-            total = [t + k_r * o / max(norm(offset), eps) ** 3 for t, o in zip(total, offset, strict=True)]
-    if radius is not None and count:
-        total = [t / count for t in total]
+            unit = k_r if radius is None else strength * 0.01 * p.extent * radius**2
+            total = [t + unit * o / max(norm(offset), eps) ** 3 for t, o in zip(total, offset, strict=True)]
     return [t * min(1.0, tau / norm(total)) for t in total] if norm(total) else total
 
 
@@ -287,7 +286,7 @@ def test_the_optimum_of_the_articulation_loss_lies_away_from_repel_points():
     )
     settled = {}
     for sign in ("paper", "away"):
-        loss = build("art", sign=sign, radius=0.1)
+        loss = build("art", sign=sign, radius=0.1, strength=0.1)  # at its clip there
         x = torch.zeros((), dtype=F64, requires_grad=True)
         optimizer = torch.optim.Adam([x], lr=1e-3)
         for _ in range(150):
@@ -302,8 +301,23 @@ def test_the_optimum_of_the_articulation_loss_lies_away_from_repel_points():
     assert settled["away"] < -0.003
 
 
+@pytest.mark.parametrize("exponent", [2.0, 3.0, 4.0])
+def test_exponent_and_count_of_repel_points_act_below_the_clip(exponent):
+    """A part 0.05 from a wall with 20 points in reach: half to twice as many points are half to twice the force; p changes it, too."""
+    inputs = make_inputs(n=40)
+    wall = 0.04 * torch.randn(40, 3, generator=torch.Generator().manual_seed(1), dtype=F64) + torch.tensor([0.05, 0.0, 0.0], dtype=F64)
+    x = torch.zeros(1, 3, dtype=F64)
+    extent = inputs.parts.extent
+    loss = build("art", exponent=exponent, radius=0.1 / extent)
+    tau = loss.tau(extent, 0, 100)
+    forces = [loss.force(x, torch.cat([wall] * n), extent, tau).norm().item() for n in (1, 2)]
+    assert 0 < forces[0] < forces[1] < tau and forces[1] == pytest.approx(2 * forces[0])
+    other = build("art", exponent=exponent + 1, radius=0.1 / extent).force(x, wall, extent, tau).norm().item()
+    assert other > 1.1 * forces[0]
+
+
 def test_the_force_is_annealed_away():
-    loss = build("art", lambda_rot=0.0)
+    loss = build("art", lambda_rot=0.0, strength=0.2)
     inputs = make_inputs(seed=10, sharp=True, noise=0.0)
     inputs = with_parts(inputs, repel_points=inputs.parts.mu1 + 0.03)
     early, late = loss(inputs).item(), loss(replace(inputs, step=75)).item()

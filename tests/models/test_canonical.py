@@ -9,6 +9,7 @@ from tiny import random_gaussians
 from p2gs.models import canonical
 from p2gs.models.canonical import CanonicalConfig, beta_weight, blend, carry, farthest_points, fuse, hungarian_pairs, motion_richness
 from p2gs.models.handover import PartMotions
+from p2gs.models.matching import motion_clusters
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors, UserError
 
@@ -127,3 +128,27 @@ def test_nothing_reconstructed_is_told():
     g.opacity_logits[:] = -5
     with pytest.raises(UserError, match="Gaussians of a state are opaque"):
         fuse(g, g, None, CanonicalConfig())
+
+
+def test_the_smaller_set_is_matched_whole():
+    generator = torch.Generator().manual_seed(3)
+    a, b = torch.rand(70, 3, generator=generator), torch.rand(200, 3, generator=generator)
+    for first, second in ((a, b), (b, a)):
+        i, j = hungarian_pairs(first, second, 90, smaller_whole=True)
+        small = i if len(first) < len(second) else j
+        assert sorted(small.tolist()) == list(range(70)) and len(set((j if small is i else i).tolist())) == 70
+    i, j = hungarian_pairs(a, b, 30, smaller_whole=True)
+    assert len(i) == 30  # 70 against 30 of the larger
+    assert len(hungarian_pairs(a, a + 0.001, 30, smaller_whole=True)[0]) == 30
+
+
+def test_motion_clusters_are_what_moves_alike():
+    generator = torch.Generator().manual_seed(3)
+    start = torch.cat([torch.rand(50, 3, generator=generator) + shift for shift in (0.0, 5.0, 10.0)])
+    end = start.clone()
+    end[50:100, 0] += 1.0
+    end[100:, 1] += 1.0
+    labels = motion_clusters(start, end, 2)
+    assert not labels[:50].any() and len(set(labels[50:100].tolist())) == len(set(labels[100:].tolist())) == 1
+    assert labels[50] != labels[100] and labels[50] > 0 and labels[100] > 0
+    assert not motion_clusters(start, start, 2).any()

@@ -4,8 +4,10 @@ import pytest
 import torch
 from tiny import random_gaussians
 
-from p2gs.models.densify import densify
+from p2gs.callbacks.densify import Densify
+from p2gs.models.densify import densify, reset_opacity
 from p2gs.models.splats import Splats, gather
+from p2gs.types import UserError
 
 
 def trained(n: int = 6) -> tuple[Splats, torch.optim.Adam]:
@@ -86,3 +88,24 @@ def test_densify_keeps_to_its_target_and_is_deterministic():
         results.append(splats.means.detach().clone())
         assert len(splats) == 53
     assert torch.equal(*results)
+
+
+def test_growth_by_threshold_takes_what_exceeds_it_and_needs_no_budget():
+    splats, optimizer = trained(8)
+    splats.opacity_logits.data.fill_(2.0)
+    splats.grad_sum, splats.seen = torch.tensor([8.0, 0, 3, 0, 0, 6, 0, 0]), torch.full((8,), 2.0)
+    added, pruned = densify(splats, optimizer, None, threshold=0.9, max_scale=9.0, generator=torch.Generator().manual_seed(0))
+    assert (added, pruned, len(splats)) == (2, 0, 10)  # means 4 and 3 per image height are 2 and 1.5 per half of it; 1.5 is 0.75
+    with pytest.raises(ValueError, match="target or a threshold"):
+        densify(splats, optimizer, None, generator=torch.Generator())
+    with pytest.raises(UserError, match="threshold above 0"):
+        Densify(budget=None)
+
+
+def test_opacities_are_reset_with_their_moments():
+    splats, optimizer = trained()
+    splats.opacity_logits.data.copy_(torch.linspace(-8, 8, 6))
+    reset_opacity(splats, optimizer, 0.01)
+    assert torch.sigmoid(splats.opacity_logits).max().item() == pytest.approx(0.01) and splats.opacity_logits[0].item() == -8
+    state = optimizer.state[splats.opacity_logits]
+    assert not state["exp_avg"].any() and not state["exp_avg_sq"].any() and optimizer.state[splats.means]["exp_avg"].any()

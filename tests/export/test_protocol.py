@@ -1,0 +1,74 @@
+"""The surfaces that ArtGS's protocol scores: nothing completed, the whole by itself, moving parts cleaned of stray Gaussians."""
+
+import pytest
+from toy import toy_scene, toy_twin
+
+from p2gs.export.evaluate import surface_scores
+from p2gs.export.mesh import part_meshes, read_mesh, write_meshes
+from p2gs.export.protocol import SurfaceOptions, largest_clusters, surface_options
+from p2gs.export.run_folder import write_twin
+from p2gs.export.sightings import sight
+from p2gs.export.tsdf import Mesh
+from p2gs.export.views import scene_cameras
+from p2gs.types import UserError
+
+
+def test_options_are_read_from_the_runs_config(tmp_path):
+    assert surface_options(tmp_path) == SurfaceOptions()
+    (tmp_path / "config.yaml").write_text("phases: {finish: {complete: false, whole: separate, cluster: 0.05, trays: 0}}")
+    assert surface_options(tmp_path) == SurfaceOptions(False, "separate", 0.05)
+    (tmp_path / "config.yaml").write_text("phases: [1]")
+    with pytest.raises(UserError, match="expected a mapping"):
+        surface_options(tmp_path)
+
+
+def test_a_moving_part_keeps_its_largest_cluster():
+    twin = toy_twin()
+    part = next(p for p in twin.parts if p.joint is not None)
+    mine = (twin.part_ids == part.id).nonzero()[:, 0]
+    stray, base = mine[:2], (twin.part_ids == 0).nonzero()[:2, 0]
+    for rows in (stray, base):
+        twin.gaussians.means[rows] += 50.0
+    kept = largest_clusters(twin, 0.5)
+    assert len(kept.gaussians) == len(twin.gaussians) - 2  # a pair far off is a cluster too, but not the largest; the base keeps all
+    assert int((kept.part_ids == part.id).sum()) == len(mine) - 2 and kept.gaussians.means[kept.part_ids == 0].max() > 40
+
+
+def test_nothing_is_completed_where_it_is_not_wanted():
+    twin, scene = toy_twin(), toy_scene()
+    cameras = [(c.state, c.camera) for c in scene_cameras(scene)]
+    seen = sight(twin, cameras, 40)
+    bare = part_meshes(twin, cameras, 40, complete=False)
+    for k, mesh in enumerate(bare):
+        assert (mesh.faces == seen.surface(k).faces).all()
+    full = part_meshes(twin, cameras, 40)
+    assert sum(len(m.faces) for m in full) != sum(len(m.faces) for m in bare)
+
+
+def test_the_whole_of_its_own_is_written_and_scored(tmp_path):
+    twin, scene = toy_twin(), toy_scene()
+    write_twin(twin, tmp_path, scene, media=False)
+    (tmp_path / "config.yaml").write_text("phases: {finish: {whole: separate, complete: false}}")
+    write_meshes(tmp_path, 40)
+    whole, parts = read_mesh(tmp_path / "meshes" / "end" / "whole.ply"), []
+    for p in twin.parts:
+        parts.append(read_mesh(tmp_path / "meshes" / "end" / f"part_{p.id}.ply"))
+    joined = Mesh.join(parts)
+    assert len(whole.faces) and len(whole.faces) != len(joined.faces)
+
+    class Truth:
+        """The parts themselves: static and movable score nothing, the whole what its own surface differs by."""
+
+        @staticmethod
+        def meshes(state):
+            from types import SimpleNamespace
+
+            folder = tmp_path / "meshes" / ("start", "end")[state]
+            dynamic = [folder / f"part_{p.id}.ply" for p in twin.parts if p.joint is not None]
+            return SimpleNamespace(static=folder / "part_0.ply", dynamic=dynamic, whole=None)
+
+    assignment = {k: k for k in range(len(twin.parts) - 1)}
+    apart = surface_scores(tmp_path, Truth, assignment, [])
+    (tmp_path / "config.yaml").write_text("phases: {finish: {complete: false}}")
+    together = surface_scores(tmp_path, Truth, assignment, [])
+    assert apart["static"]["value"] == together["static"]["value"] and apart["whole"]["value"] > 1.2 * together["whole"]["value"]
