@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Callable, Optional
 
 import numpy as np
 
-from p2gs.export.convex import Piece, decompose, intersect
+from p2gs.export.clearance import clear_links
+from p2gs.export.convex import Piece, decompose
 from p2gs.export.mesh import read_meshes, write_meshes
 from p2gs.export.texture import Texture
 from p2gs.export.tsdf import Mesh, vertex_normals
@@ -84,12 +85,14 @@ class Link:
 
 @dataclass(frozen=True)
 class Asset:
-    """links[0] is the static base.  overlapping: pairs of link names that a simulator should not make collide."""
+    """links[0] is the static base.  blocking: (moving link, other link) that run into each other in one of the other's recorded states, as
+    a door before a drawer does.  lost: share of a link's collision volume that was trimmed to give joints room, by name."""
 
     name: str
     links: list[Link]
     up: str
-    overlapping: list[tuple[str, str]]
+    blocking: list[tuple[str, str]] = field(default_factory=list)
+    lost: dict[str, float] = field(default_factory=dict)
 
     @property
     def moving(self) -> list[Link]:
@@ -133,7 +136,11 @@ def load_asset(
     if not pairs or pairs[0][0].joint is not None:
         raise UserError(f"{run_dir}: the static part has no surface, so there is no base to hang joints on")
     links = [make_link(part.id, part.joint, mesh, place, density, max_faces, solid, texture) for part, mesh in pairs]
-    return Asset(run_dir.resolve().name, links, up, overlapping_pairs(links) if solid else [])
+    name = run_dir.resolve().name
+    if not solid:
+        return Asset(name, links, up)
+    cleared = clear_links(links)
+    return Asset(name, cleared.links, up, cleared.blocking, cleared.lost)
 
 
 def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placement:
@@ -206,27 +213,6 @@ def joint_motion(hinge: Hinge, value: float) -> np.ndarray:
     T[:3, :3] += np.sin(value) * K + (1 - np.cos(value)) * K @ K
     T[:3, 3] = hinge.origin - T[:3, :3] @ hinge.origin
     return T
-
-
-def overlapping_pairs(links: list[Link]) -> list[tuple[str, str]]:
-    """Moving links that touch each other in some combination of their recorded end states, and every moving link with the base.
-
-    A simulator should not make these pairs collide: scanned shells overlap by a voxel where they were shut.
-    """
-    size = max(float(np.ptp(np.concatenate([p.vertices for p in link.collision]), axis=0).max()) for link in links)
-    moving = [link for link in links if link.joint is not None]
-    pairs = [(links[0].name, link.name) for link in moving]
-
-    def posed(link: Link, value: float) -> list[Piece]:
-        T = joint_motion(link.joint, value)
-        return [Piece((p.vertices + link.origin) @ T[:3, :3].T + T[:3, 3], p.faces) for p in link.collision]
-
-    for i, a in enumerate(moving):
-        for b in moving[i + 1 :]:
-            states = [(posed(a, x), posed(b, y)) for x in (0.0, a.joint.motion) for y in (0.0, b.joint.motion)]
-            if any(intersect(p, q, 1e-4 * size) for ps, qs in states for p in ps for q in qs):
-                pairs.append((a.name, b.name))
-    return pairs
 
 
 def simplify(mesh: Mesh, max_faces: int) -> Mesh:
