@@ -20,6 +20,8 @@ from p2gs.types import Joint, UserError
 
 DENSITY = 300.0  # kg / m^3 of the convex pieces: chipboard furniture with some air in it
 MAX_FACES = 40_000  # a part's visual mesh; simulators refuse meshes of several hundred thousand
+HOLD = 0.02  # friction of a joint, in the weight that hangs on it: holds where the axis leans by a degree, as found axes do
+GRAVITY = 9.81  # m / s^2
 SETTLE = 0.5  # seconds in which an undriven joint loses most of its speed; sets the default damping
 UPS = ("z", "y", "x")
 ORIGINS = ("keep", "center", "bottom")
@@ -53,7 +55,7 @@ class Inertia:
 class Hinge:
     """A joint in SI units of the target. axis [3] unit, origin [3].  lower, upper, motion: radians or metres, 0 = start state.
 
-    damping: N m s / rad or N s / m.
+    damping: N m s / rad or N s / m.  friction: N m or N that holds the joint while it does not move.
     """
 
     type: str
@@ -63,6 +65,7 @@ class Hinge:
     upper: float
     motion: float
     damping: float
+    friction: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -175,7 +178,7 @@ def make_link(
         unit = np.pi / 180 if joint.type == "revolute" else place.scale
         lower, upper = sorted(float(v) * unit for v in joint.limits)
         resistance = effective_inertia(inertia, axis) if joint.type == "revolute" else inertia.mass
-        hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE)
+        hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE, joint_friction(inertia, axis, joint.type))
     name = "base" if joint is None else f"part_{part}"
     colour = tuple(float(c) for c in mesh.colours.mean(0) / 255)
     return Link(name, part, visual, pieces, inertia, hinge, colour, texture(part, world) if texture else None)
@@ -194,6 +197,12 @@ def inertia_of(pieces: list[Piece], density: float) -> Inertia:
         d = c - center
         total += np.asarray(p["inertia"]) * density + m * ((d @ d) * np.eye(3) - np.outer(d, d))
     return Inertia(float(masses.sum()), center, (total + total.T) / 2)
+
+
+def joint_friction(inertia: Inertia, axis: np.ndarray, kind: str) -> float:
+    """``HOLD`` of the part's weight; on a hinge times the distance of its centre of mass from the axis. N or N m."""
+    arm = 1.0 if kind == "prismatic" else float(np.linalg.norm(np.cross(axis, inertia.center)))
+    return HOLD * GRAVITY * inertia.mass * arm
 
 
 def effective_inertia(inertia: Inertia, axis: np.ndarray) -> float:

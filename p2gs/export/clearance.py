@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 GAP = 0.003  # share of the object's diagonal that is left between parts: Bullet alone adds 1 mm around each hull
 SHALLOW = 0.02  # share of the diagonal up to which an overlap is an error of the surfaces, which both parts give way to by half
+ROUNDS = 4  # passes in which pieces may fall apart; the last one cuts by single planes, so that it ends
 LEAST = 0.15  # share of a piece's thickness (and of its volume) below which what is left of it goes
 
 
@@ -143,30 +144,69 @@ def _hull_of(piece: Piece, poses: tuple[np.ndarray, ...]) -> Piece:
     return Piece(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))
 
 
+def without(piece: Piece, sweep: Piece, gap: float) -> list[Piece]:
+    """What of a piece lies outside the box of a sweep and ``gap`` beyond it, as convex pieces: the largest is cut off first."""
+    import trimesh
+
+    to_box, extents = trimesh.bounds.oriented_bounds(trimesh.Trimesh(sweep.vertices, sweep.faces, process=False))
+    axes, half = to_box[:3, :3], extents / 2 + gap
+    center = -axes.T @ to_box[:3, 3]
+    planes = [(s * axes[k], s * float(axes[k] @ center) + half[k]) for k in range(3) for s in (1.0, -1.0)]
+    out: list[Piece] = []
+    rest: Optional[Piece] = piece
+    while planes and rest is not None:
+        outside = [cut(rest, -n, -d) for n, d in planes]
+        k = int(np.argmax([0.0 if p is None else p.volume for p in outside]))
+        n, d = planes.pop(k)
+        if outside[k] is not None and _thickness(outside[k]) > gap:
+            out.append(outside[k])
+        rest = cut(rest, n, d)
+    return out
+
+
+def _moved_by(piece: Piece, T: np.ndarray) -> Piece:
+    return Piece(piece.vertices @ T[:3, :3].T + T[:3, 3], piece.faces)
+
+
 def _free(a: Body, b: Body, values: np.ndarray, other: np.ndarray, gap: float, diagonal: float) -> None:
     """Trim pieces of both until those of ``a``, moved through ``values``, keep ``gap`` from those of ``b`` at ``other``."""
     for poses in _poses(a, values):
-        gone_a: set[int] = set()
-        for i, j in _close(a, b, poses, other, gap):
-            if i in gone_a or b.pieces[j] is None:
-                continue
-            depth, normal, offset_a, offset_b = separation(_hull_of(a.pieces[i], poses), _hull_of(b.pieces[j], (other,)))
-            if depth <= -gap:
-                continue
-            share = 0.5 if depth <= SHALLOW * diagonal else 0.0  # what reaches far into the sweep is wrong: the part passed there
-            plane = offset_b + (offset_a - offset_b) * (1 - share)  # a lies below offset_a, b above offset_b, along the normal
-            trimmed: Optional[Piece] = a.pieces[i]
-            for T in poses:
-                if trimmed is not None:
-                    trimmed = _cut_world(trimmed, T, normal, plane - gap / 2)
-            left = _cut_world(b.pieces[j], other, -normal, -(plane + gap / 2))
-            if trimmed is None:
-                gone_a.add(i)
-            else:
-                a.pieces[i] = trimmed
-            b.pieces[j] = left
-        a.pieces = [p for i, p in enumerate(a.pieces) if i not in gone_a]
-        b.pieces = [p for p in b.pieces if p is not None]
+        for last in (False,) * ROUNDS + (True,):  # pieces that fell apart are looked at again
+            if not _trim(a, b, poses, other, gap, np.inf if last else SHALLOW * diagonal):
+                break
+
+
+def _trim(a: Body, b: Body, poses: tuple[np.ndarray, ...], other: np.ndarray, gap: float, shallow: float) -> bool:
+    """One pass over the pairs of pieces: both give way by half where they overlap by up to ``shallow``; beyond that the piece of ``b`` is
+    wrong, as the part passed there, and what of it lies in the sweep goes. True where a piece fell apart."""
+    gone_a: set[int] = set()
+    new: list[Piece] = []
+    kept: list[Optional[Piece]] = list(b.pieces)
+    for i, j in _close(a, b, poses, other, gap):
+        mine, theirs = a.pieces[i], kept[j]
+        if i in gone_a or theirs is None:
+            continue
+        sweep, there = _hull_of(mine, poses), _hull_of(theirs, (other,))
+        depth, normal, offset_a, offset_b = separation(sweep, there)
+        if depth <= -gap:
+            continue
+        if depth > shallow:
+            kept[j] = None
+            new += [_moved_by(q, np.linalg.inv(other)) for q in without(there, sweep, gap)]
+            continue
+        plane = (offset_a + offset_b) / 2  # a ends at offset_a, b begins at offset_b, along the normal
+        trimmed: Optional[Piece] = mine
+        for T in poses:
+            if trimmed is not None:
+                trimmed = _cut_world(trimmed, T, normal, plane - gap / 2)
+        if trimmed is None:
+            gone_a.add(i)
+        else:
+            a.pieces[i] = trimmed
+        kept[j] = _cut_world(theirs, other, -normal, -(plane + gap / 2))
+    a.pieces = [p for i, p in enumerate(a.pieces) if i not in gone_a]
+    b.pieces = [p for p in kept if p is not None] + new
+    return bool(new)
 
 
 def _cut_world(piece: Piece, T: np.ndarray, normal: np.ndarray, offset: float) -> Optional[Piece]:

@@ -64,6 +64,7 @@ def _body(parent: ET.Element, link: Link) -> ET.Element:
             body, "joint", {"class": "joint"}, name=f"joint_{link.part}", type=kind, pos="0 0 0", axis=numbers(hinge.axis)
         )
         joint.attrib |= {"range": numbers((hinge.lower, hinge.upper)), "damping": number(hinge.damping), "armature": number(0.01 * weight)}
+        joint.attrib["frictionloss"] = number(hinge.friction)
     look = {"rgba": numbers((*link.colour, 1.0))} if link.texture is None else {"material": link.name}
     ET.SubElement(body, "geom", {"class": "visual"} | look, mesh=link.name)
     for i in range(len(link.collision)):
