@@ -19,6 +19,15 @@ from p2gs.models.joint_range import extend_ranges
 from p2gs.types import Joint, UserError
 
 DENSITY = 300.0  # kg / m^3 of the convex pieces: chipboard furniture with some air in it
+DENSITIES = {  # kg / m^3 of the collision pieces, which fill a shell's hollow walls: solid materials weigh more than parts made of them
+    "chipboard": DENSITY,  # default
+    "wood": 550.0,  # pine, air-dry
+    "plastic": 400.0,  # ABS shells of about a third
+    "metal": 900.0,  # sheet steel over foam or air, as appliances are
+    "glass": 2500.0,
+    "ceramic": 2300.0,
+}
+LIKELY_SIZE = (0.05, 3.0)  # m, longest side: a stapler to a wardrobe
 MAX_FACES = 40_000  # a part's visual mesh; simulators refuse meshes of several hundred thousand
 HOLD = 0.02  # friction of a joint, in the weight that hangs on it: holds where the axis leans by a degree, as found axes do
 GRAVITY = 9.81  # m / s^2
@@ -144,6 +153,23 @@ def load_asset(
         return Asset(name, links, up)
     cleared = clear_links(links)
     return Asset(name, cleared.links, up, cleared.blocking, cleared.lost)
+
+
+def start_box(run_dir: Path | str) -> np.ndarray:
+    """Lower and upper corner [2, 3] of the whole object in the start state, in input units. The meshes are made if they are not there."""
+    meshes = read_meshes(run_dir)
+    if meshes is None:
+        write_meshes(run_dir)
+        meshes = read_meshes(run_dir)
+    points = np.concatenate([m.vertices for m in meshes])
+    return np.array([points.min(0), points.max(0)])
+
+
+def unlikely_size(longest: float) -> Optional[str]:
+    """A sentence where the longest side [m] is none that household objects have."""
+    if LIKELY_SIZE[0] <= longest <= LIKELY_SIZE[1]:
+        return None
+    return f"the object's longest side comes out as {longest:.3g} m: give metres per input unit with --scale, or --height of the object in metres"
 
 
 def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placement:
