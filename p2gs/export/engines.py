@@ -53,16 +53,18 @@ class JointFacts:
 @dataclass(frozen=True)
 class EngineResult:
     """reached: of each joint, the lowest and highest share of its range it got to (0 and 1 are its limits).  speed: the fastest joint's
-    after two seconds under gravity, from each recorded state [rad/s or m/s]."""
+    after two seconds under gravity, from each recorded state [rad/s or m/s].  missing: joints of twin.urdf that the engine does not have."""
 
     engine: str
     reached: dict[str, tuple[float, float]]
     speed: tuple[float, float]
+    missing: tuple[str, ...] = ()
 
     @property
     def problems(self) -> list[str]:
         """One sentence each; empty where all is well."""
-        out = [
+        out = [f"{name} of twin.urdf is not there" for name in self.missing]
+        out += [
             f"{name} moves from {100 * lo:.0f} to {100 * hi:.0f} % of its range, not from 0 to 100"
             for name, (lo, hi) in self.reached.items()
             if lo > NEAR or hi < 1 - NEAR
@@ -89,6 +91,7 @@ def joint_facts(urdf: Path) -> list[JointFacts]:
 def run_engine(name: str, engine: Engine, facts: list[JointFacts]) -> EngineResult:
     """Sweep every joint, the others held in the recorded state that lets it go further, then let all lie from both recorded states."""
     order = [next(f for f in facts if f.name == n) for n in engine.names]
+    missing = tuple(f.name for f in facts if f.name not in engine.names)
     end = np.array([f.end for f in order])
     engine.gravity(False)
     reached = {f.name: _best_sweep(engine, order, i, end) for i, f in enumerate(order)}
@@ -100,7 +103,7 @@ def run_engine(name: str, engine: Engine, facts: list[JointFacts]) -> EngineResu
         for _ in range(round(REST / STEP)):
             _, velocity = engine.step(np.zeros(len(order)))
         speeds.append(float(np.abs(velocity).max(initial=0.0)))
-    return EngineResult(name, reached, (speeds[0], speeds[1]))
+    return EngineResult(name, reached, (speeds[0], speeds[1]), missing)
 
 
 def _best_sweep(engine: Engine, facts: list[JointFacts], i: int, end: np.ndarray) -> tuple[float, float]:
