@@ -79,7 +79,7 @@ def parser(prog: str = "p2gs") -> Parser:
     export.add_argument("--out", metavar="DIR", help="folder to write to (default RUN)")
     size = export.add_mutually_exclusive_group()
     size.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of the input (default 1)")
-    size.add_argument("--height", type=float, metavar="M", help="height of the object in metres, as it was at the start, instead of --scale")
+    size.add_argument("--height", type=float, metavar="M", help="the object's height at the start in metres, instead of --scale")
     export.add_argument("--material", default="chipboard", help="density: chipboard (default), wood, plastic, metal, glass, ceramic")
     export.add_argument("--up", choices=("x", "y", "z"), help="axis that points up in the file (default: the format's own)")
     export.add_argument("--extend_range", "--extend-range", action="store_true", help="joint limits until parts touch, not as observed")

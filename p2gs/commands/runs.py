@@ -78,8 +78,8 @@ def export(args: argparse.Namespace) -> int:
     unlikely = unlikely_size(scale * float(sides.max()))
     if unlikely is not None:
         print(f"warning: {unlikely}", file=sys.stderr)
-    options = {"scale": scale, "material": args.material, "up": args.up, "origin": args.origin, "extend_range": args.extend_range, "texture": args.texture}
-    for path in export_run(run, args.format, out=args.out, **options):
+    options = {"up": args.up, "origin": args.origin, "extend_range": args.extend_range, "texture": args.texture, "material": args.material}
+    for path in export_run(run, args.format, out=args.out, scale=scale, **options):
         print(path)
     return 0
 

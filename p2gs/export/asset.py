@@ -169,7 +169,7 @@ def unlikely_size(longest: float) -> Optional[str]:
     """A sentence where the longest side [m] is none that household objects have."""
     if LIKELY_SIZE[0] <= longest <= LIKELY_SIZE[1]:
         return None
-    return f"the object's longest side comes out as {longest:.3g} m: give metres per input unit with --scale, or --height of the object in metres"
+    return f"the object's longest side comes out as {longest:.3g} m: give metres per unit of the input with --scale, or its --height"
 
 
 def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placement:
@@ -204,7 +204,8 @@ def make_link(
         unit = np.pi / 180 if joint.type == "revolute" else place.scale
         lower, upper = sorted(float(v) * unit for v in joint.limits)
         resistance = effective_inertia(inertia, axis) if joint.type == "revolute" else inertia.mass
-        hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE, joint_friction(inertia, axis, joint.type))
+        friction = joint_friction(inertia, axis, joint.type)
+        hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE, friction)
     name = "base" if joint is None else f"part_{part}"
     colour = tuple(float(c) for c in mesh.colours.mean(0) / 255)
     return Link(name, part, visual, pieces, inertia, hinge, colour, texture(part, world) if texture else None)

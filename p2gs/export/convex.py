@@ -86,7 +86,7 @@ def spread(vertices: np.ndarray, count: int = POINTS) -> tuple[np.ndarray, float
         cell *= 1.25
 
 
-def decompose(vertices: np.ndarray, max_pieces: int = 40, waste: float = 0.0005, min_thickness: Optional[float] = None) -> list[Piece]:
+def decompose(vertices: np.ndarray, max_pieces: int = 40, waste: float = 5e-4, min_thickness: Optional[float] = None) -> list[Piece]:
     """Convex pieces that together cover the surface's vertices [N, 3].
 
     waste: pieces merge while that encloses no more than this fraction of the cube of the size; beyond that only to get down to
@@ -141,8 +141,8 @@ def cells_of(points: np.ndarray, spacing: float) -> tuple[np.ndarray, list[np.nd
 
 
 def separation(a: Piece, b: Piece) -> tuple[float, np.ndarray, float, float]:
-    """How deep two pieces reach into each other (negative: the gap between them is at least that wide), the unit normal [3] from a to b
-    along which that is least, and along it the last of a and the first of b. (Separating axis theorem: normals of both, then edge pairs.)"""
+    """How deep two pieces reach into each other (negative: the gap between them is at least that wide), the unit normal
+    [3] from a to b along which that is least, and along it the last of a, the first of b. (Separating axes: normals, then edge pairs.)"""
     best = _least(a, b, np.concatenate([a.planes()[0], -b.planes()[0]]))
     if best[0] <= 0:
         return best
@@ -186,14 +186,3 @@ def cut(piece: Piece, normal: np.ndarray, offset: float) -> Optional[Piece]:
         return None
     mesh = trimesh.convex.convex_hull(points)
     return Piece(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))
-
-
-def intersect(a: Piece, b: Piece, margin: float = 0.0) -> bool:
-    """Whether two pieces share a ball of radius ``margin`` or more (linear programme for the largest ball in both)."""
-    from scipy.optimize import linprog
-
-    if (a.vertices.min(0) > b.vertices.max(0)).any() or (b.vertices.min(0) > a.vertices.max(0)).any():
-        return False
-    n, d = (np.concatenate(x) for x in zip(a.planes(), b.planes(), strict=True))
-    res = linprog([0, 0, 0, -1], A_ub=np.c_[n, np.ones(len(n))], b_ub=d, bounds=[(None, None)] * 3 + [(0, None)], method="highs")
-    return bool(res.status == 0 and res.x[3] > margin)

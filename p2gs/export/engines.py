@@ -53,7 +53,7 @@ class JointFacts:
 @dataclass(frozen=True)
 class EngineResult:
     """reached: of each joint, the lowest and highest share of its range it got to (0 and 1 are its limits).  speed: the fastest joint's
-    after two seconds under gravity, from each recorded state [rad/s or m/s].  missing: joints of twin.urdf that the engine does not have."""
+    after two seconds under gravity, from each recorded state [rad/s or m/s].  missing: joints of twin.urdf that the engine lacks."""
 
     engine: str
     reached: dict[str, tuple[float, float]]
@@ -118,7 +118,7 @@ def _best_sweep(engine: Engine, facts: list[JointFacts], i: int, end: np.ndarray
 
 
 def _sweep(engine: Engine, joint: JointFacts, i: int, held: np.ndarray) -> tuple[float, float]:
-    """Lowest and highest share of the range that joint ``i`` gets to from where ``held`` has it, pushed to one end and then to the other."""
+    """Lowest and highest share of the range that joint ``i`` gets to from ``held``, pushed to one end and then to the other."""
     span = max(joint.upper - joint.lower, 1e-9)
     place, low, high = held.copy(), 1.0, 0.0
     engine.put(place)

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
+from solids import intersect
 
 from p2gs.export.asset import Hinge, Inertia, Link, joint_motion
 from p2gs.export.clearance import GAP, clear_links, without
-from p2gs.export.convex import Piece, cut, hull, intersect, separation
+from p2gs.export.convex import Piece, cut, hull, separation
 from p2gs.export.tsdf import Mesh
 
 

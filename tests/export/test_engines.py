@@ -10,6 +10,7 @@ from p2gs.app import run
 from p2gs.export.asset import Asset, Inertia
 from p2gs.export.check import check_folder
 from p2gs.export.clearance import clear_links
+from p2gs.export.convex import decompose
 from p2gs.export.engines import ENGINES, check_engine, installed
 from p2gs.export.mjcf import write_mjcf
 from p2gs.export.tsdf import Mesh
@@ -84,3 +85,31 @@ def test_the_command_prints_a_table_and_says_by_its_exit_code_whether_all_is_wel
     (tmp_path / "twin.xml").write_text('<mujoco><option gravity="0 -9.81 0"/></mujoco>')
     with pytest.raises(UserError, match="--up z"):
         check_folder(tmp_path)
+
+
+@pytest.mark.parametrize("lid", [False, True])
+def test_a_ball_dropped_into_an_open_drawer_stays_in_it(lid, tmp_path):
+    """The drawer's pieces are made of points on its surface, as exports make them; a lid over it is what the test must notice."""
+    import mujoco
+
+    lo, hi = np.array([0.05, -0.4, -0.2]), np.array([0.45, 0.3, 0.1])
+    rng = np.random.default_rng(0)
+    points = lo + rng.random((30000, 3)) * (hi - lo)
+    side = rng.integers(0, 6 if lid else 5, len(points))  # the sixth side is the upper one
+    points[np.arange(len(points)), side % 3] = np.where(side[:, None] >= 3, hi, lo)[np.arange(len(points)), side % 3]
+    drawer = link("part_1", decompose(points), slide((0, -1, 0), 0.5))
+    base = link("base", [block((-0.5, -0.4, -0.5), (0.5, 0.4, -0.45))])
+    write(clear_links([base, drawer]).links, tmp_path)
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "twin.xml"))
+    ball = spec.worldbody.add_body(name="ball", pos=[0.25, -0.65, 0.2])
+    ball.add_freejoint()
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.04, 0, 0])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    at, speed = model.joint("joint_1").qposadr[0], model.joint("joint_1").dofadr[0]
+    for _ in range(1000):
+        data.qpos[at], data.qvel[speed] = 0.5, 0
+        mujoco.mj_step(model, data)
+    x, y, z = data.body("ball").xpos
+    assert lo[0] < x < hi[0] and lo[1] - 0.5 < y < hi[1] - 0.5 and z > lo[2]
+    assert (z > hi[2]) == lid
