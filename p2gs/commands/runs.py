@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from p2gs.types import UserError
@@ -59,13 +60,35 @@ def view(args: argparse.Namespace) -> int:
 
 
 def export(args: argparse.Namespace) -> int:
-    """Other formats of the twin; prints the files."""
+    """Other formats of the twin; prints the files. With --check the verdict on those that are there: 1 where one fails."""
+    run = finished_run(args.run)
+    if args.check:
+        return _check(run if args.out is None else Path(args.out))
+    from p2gs.export.asset import start_box, unlikely_size
     from p2gs.export.formats import export_run
 
-    run = finished_run(args.run)
     if not args.scale > 0:
         raise UserError(f"--scale: expected a positive number of metres per unit, got {args.scale:g}")
-    options = {"scale": args.scale, "up": args.up, "origin": args.origin, "extend_range": args.extend_range, "texture": args.texture}
-    for path in export_run(run, args.format, out=args.out, **options):
+    box = start_box(run)
+    scale, sides = args.scale, box[1] - box[0]
+    if args.height is not None:
+        if not args.height > 0:
+            raise UserError(f"--height: expected a positive number of metres, got {args.height:g}")
+        scale = args.height / float(sides[2])
+    unlikely = unlikely_size(scale * float(sides.max()))
+    if unlikely is not None:
+        print(f"warning: {unlikely}", file=sys.stderr)
+    options = {"up": args.up, "origin": args.origin, "extend_range": args.extend_range, "texture": args.texture, "material": args.material}
+    for path in export_run(run, args.format, out=args.out, scale=scale, **options):
         print(path)
     return 0
+
+
+def _check(folder: Path) -> int:
+    from rich import print as rich_print
+
+    from p2gs.export.check import check_folder, check_table
+
+    results = check_folder(folder)
+    rich_print(check_table(results))
+    return 1 if any(r.state == "fails" for r in results) else 0

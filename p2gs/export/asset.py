@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Callable, Optional
 
 import numpy as np
 
-from p2gs.export.convex import Piece, decompose, intersect
+from p2gs.export.clearance import clear_links
+from p2gs.export.convex import Piece, decompose
 from p2gs.export.mesh import read_meshes, write_meshes
 from p2gs.export.texture import Texture
 from p2gs.export.tsdf import Mesh, vertex_normals
@@ -18,7 +19,18 @@ from p2gs.models.joint_range import extend_ranges
 from p2gs.types import Joint, UserError
 
 DENSITY = 300.0  # kg / m^3 of the convex pieces: chipboard furniture with some air in it
+DENSITIES = {  # kg / m^3 of the collision pieces, which fill a shell's hollow walls: solid materials weigh more than parts made of them
+    "chipboard": DENSITY,  # default
+    "wood": 550.0,  # pine, air-dry
+    "plastic": 400.0,  # ABS shells of about a third
+    "metal": 900.0,  # sheet steel over foam or air, as appliances are
+    "glass": 2500.0,
+    "ceramic": 2300.0,
+}
+LIKELY_SIZE = (0.05, 3.0)  # m, longest side: a stapler to a wardrobe
 MAX_FACES = 40_000  # a part's visual mesh; simulators refuse meshes of several hundred thousand
+HOLD = 0.02  # friction of a joint, in the weight that hangs on it: holds where the axis leans by a degree, as found axes do
+GRAVITY = 9.81  # m / s^2
 SETTLE = 0.5  # seconds in which an undriven joint loses most of its speed; sets the default damping
 UPS = ("z", "y", "x")
 ORIGINS = ("keep", "center", "bottom")
@@ -52,7 +64,7 @@ class Inertia:
 class Hinge:
     """A joint in SI units of the target. axis [3] unit, origin [3].  lower, upper, motion: radians or metres, 0 = start state.
 
-    damping: N m s / rad or N s / m.
+    damping: N m s / rad or N s / m.  friction: N m or N that holds the joint while it does not move.
     """
 
     type: str
@@ -62,6 +74,7 @@ class Hinge:
     upper: float
     motion: float
     damping: float
+    friction: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -84,12 +97,14 @@ class Link:
 
 @dataclass(frozen=True)
 class Asset:
-    """links[0] is the static base.  overlapping: pairs of link names that a simulator should not make collide."""
+    """links[0] is the static base.  blocking: (moving link, other link) that run into each other in one of the other's recorded states, as
+    a door before a drawer does.  lost: share of a link's collision volume that was trimmed to give joints room, by name."""
 
     name: str
     links: list[Link]
     up: str
-    overlapping: list[tuple[str, str]]
+    blocking: list[tuple[str, str]] = field(default_factory=list)
+    lost: dict[str, float] = field(default_factory=dict)
 
     @property
     def moving(self) -> list[Link]:
@@ -133,7 +148,28 @@ def load_asset(
     if not pairs or pairs[0][0].joint is not None:
         raise UserError(f"{run_dir}: the static part has no surface, so there is no base to hang joints on")
     links = [make_link(part.id, part.joint, mesh, place, density, max_faces, solid, texture) for part, mesh in pairs]
-    return Asset(run_dir.resolve().name, links, up, overlapping_pairs(links) if solid else [])
+    name = run_dir.resolve().name
+    if not solid:
+        return Asset(name, links, up)
+    cleared = clear_links(links)
+    return Asset(name, cleared.links, up, cleared.blocking, cleared.lost)
+
+
+def start_box(run_dir: Path | str) -> np.ndarray:
+    """Lower and upper corner [2, 3] of the whole object in the start state, in input units. The meshes are made if they are not there."""
+    meshes = read_meshes(run_dir)
+    if meshes is None:
+        write_meshes(run_dir)
+        meshes = read_meshes(run_dir)
+    points = np.concatenate([m.vertices for m in meshes])
+    return np.array([points.min(0), points.max(0)])
+
+
+def unlikely_size(longest: float) -> Optional[str]:
+    """A sentence where the longest side [m] is none that household objects have."""
+    if LIKELY_SIZE[0] <= longest <= LIKELY_SIZE[1]:
+        return None
+    return f"the object's longest side comes out as {longest:.3g} m: give metres per unit of the input with --scale, or its --height"
 
 
 def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placement:
@@ -168,7 +204,8 @@ def make_link(
         unit = np.pi / 180 if joint.type == "revolute" else place.scale
         lower, upper = sorted(float(v) * unit for v in joint.limits)
         resistance = effective_inertia(inertia, axis) if joint.type == "revolute" else inertia.mass
-        hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE)
+        friction = joint_friction(inertia, axis, joint.type)
+        hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE, friction)
     name = "base" if joint is None else f"part_{part}"
     colour = tuple(float(c) for c in mesh.colours.mean(0) / 255)
     return Link(name, part, visual, pieces, inertia, hinge, colour, texture(part, world) if texture else None)
@@ -189,6 +226,12 @@ def inertia_of(pieces: list[Piece], density: float) -> Inertia:
     return Inertia(float(masses.sum()), center, (total + total.T) / 2)
 
 
+def joint_friction(inertia: Inertia, axis: np.ndarray, kind: str) -> float:
+    """``HOLD`` of the part's weight; on a hinge times the distance of its centre of mass from the axis. N or N m."""
+    arm = 1.0 if kind == "prismatic" else float(np.linalg.norm(np.cross(axis, inertia.center)))
+    return HOLD * GRAVITY * inertia.mass * arm
+
+
 def effective_inertia(inertia: Inertia, axis: np.ndarray) -> float:
     """About a unit axis through the link's origin, kg m^2."""
     arm = np.cross(axis, inertia.center)
@@ -206,27 +249,6 @@ def joint_motion(hinge: Hinge, value: float) -> np.ndarray:
     T[:3, :3] += np.sin(value) * K + (1 - np.cos(value)) * K @ K
     T[:3, 3] = hinge.origin - T[:3, :3] @ hinge.origin
     return T
-
-
-def overlapping_pairs(links: list[Link]) -> list[tuple[str, str]]:
-    """Moving links that touch each other in some combination of their recorded end states, and every moving link with the base.
-
-    A simulator should not make these pairs collide: scanned shells overlap by a voxel where they were shut.
-    """
-    size = max(float(np.ptp(np.concatenate([p.vertices for p in link.collision]), axis=0).max()) for link in links)
-    moving = [link for link in links if link.joint is not None]
-    pairs = [(links[0].name, link.name) for link in moving]
-
-    def posed(link: Link, value: float) -> list[Piece]:
-        T = joint_motion(link.joint, value)
-        return [Piece((p.vertices + link.origin) @ T[:3, :3].T + T[:3, 3], p.faces) for p in link.collision]
-
-    for i, a in enumerate(moving):
-        for b in moving[i + 1 :]:
-            states = [(posed(a, x), posed(b, y)) for x in (0.0, a.joint.motion) for y in (0.0, b.joint.motion)]
-            if any(intersect(p, q, 1e-4 * size) for ps, qs in states for p in ps for q in qs):
-                pairs.append((a.name, b.name))
-    return pairs
 
 
 def simplify(mesh: Mesh, max_faces: int) -> Mesh:

@@ -9,6 +9,7 @@ import numpy as np
 
 from p2gs.export.asset import Asset, Link
 from p2gs.export.texture import Texture
+from p2gs.export.tsdf import vertex_normals
 
 FOLDER = "assets"
 
@@ -48,15 +49,21 @@ def write_obj(
         if texture is not None:
             file.write(f"mtllib {path.stem}.mtl\n")
         _write_rows(file, rows, form)
+        if colours is not None:  # of what is shown; converters to USD take a mesh without normals for an error
+            _write_rows(file, vertex_normals(vertices, faces), "vn %.4f %.4f %.4f")
         if texture is None:
-            _write_rows(file, faces + 1, "f %d %d %d")
+            corners = np.repeat((faces + 1).reshape(-1, 3, 1), 1 if colours is None else 2, 2).reshape(len(faces), -1)
+            _write_rows(file, corners, "f %d %d %d" if colours is None else "f %d//%d %d//%d %d//%d")
             return
         texture.save(path.with_suffix(".png"))
         path.with_suffix(".mtl").write_text(f"newmtl {path.stem}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {path.stem}.png\n")
         _write_rows(file, texture.uv.reshape(-1, 2), "vt %.7g %.7g")
         file.write(f"usemtl {path.stem}\n")
         corner = np.arange(1, faces.size + 1).reshape(-1, 3)
-        _write_rows(file, np.stack([faces + 1, corner], 2).reshape(-1, 6), "f %d/%d %d/%d %d/%d")
+        if colours is None:
+            _write_rows(file, np.stack([faces + 1, corner], 2).reshape(-1, 6), "f %d/%d %d/%d %d/%d")
+        else:
+            _write_rows(file, np.stack([faces + 1, corner, faces + 1], 2).reshape(-1, 9), "f %d/%d/%d %d/%d/%d %d/%d/%d")
 
 
 def _write_rows(file: TextIO, rows: np.ndarray, form: str, chunk: int = 4096) -> None:

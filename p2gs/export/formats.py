@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Callable, Iterable, Optional
 
-from p2gs.export.asset import Asset, load_asset
+from p2gs.export.asset import DENSITIES, Asset, load_asset
 from p2gs.export.assets_dir import write_obj
 from p2gs.export.texture import Baker
 from p2gs.registry import Registry
@@ -84,13 +84,15 @@ def export_run(
     origin: str = "keep",
     extend_range: bool = False,
     texture: bool = False,
+    material: str = "chipboard",
 ) -> list[Path]:
     """Write a finished run in the named formats (``all``: every one) into ``out`` (default the run's folder); returns the files.
 
     scale: metres per input unit.  up: z, y or x, by default what the format expects.  origin: keep, center or bottom.
     extend_range: joint limits go on beyond the observed motion until parts touch (twin.json keeps what was observed).
     texture: parts get baked textures in every format but PLY, which knows none.
-    Raises UserError for an unknown format, with the nearest name, and for textures that no named format holds.
+    material: one of ``DENSITIES``, which the masses go by.
+    Raises UserError for an unknown format or material, with the nearest name, and for textures that no named format holds.
     """
     names = list(dict.fromkeys(n for f in formats for n in (EXPORTERS if f == "all" else [f])))
     if not names:
@@ -100,6 +102,8 @@ def export_run(
         raise UserError(f"--texture: {', '.join(names)} holds vertex colours and no textures; name another format as well, or leave it out")
     out = Path(out) if out is not None else Path(run_dir)
     out.mkdir(parents=True, exist_ok=True)
+    if material not in DENSITIES:
+        raise UserError(f"--material is '{material}', expected one of {', '.join(DENSITIES)}")
     axes = {name: up or DEFAULT_UP.get(name, "z") for name in writers}
     solid = {axes[name] for name in writers if name not in FOR_LOOKS}
     assets: dict[str, Asset] = {}
@@ -108,6 +112,7 @@ def export_run(
     for name, write in writers.items():
         axis = axes[name]
         if axis not in assets:
-            assets[axis] = load_asset(run_dir, scale, axis, origin, solid=axis in solid, extend_range=extend_range, texture=baker)
+            options = {"solid": axis in solid, "extend_range": extend_range, "texture": baker}
+            assets[axis] = load_asset(run_dir, scale, axis, origin, DENSITIES[material], **options)
         written.append(write(assets[axis], out))
     return written

@@ -77,13 +77,16 @@ def glb_bytes(asset: Asset) -> bytes:
     number = {link.name: i for i, link in enumerate(textured)}
     for mesh in meshes:
         mesh["primitives"][0]["material"] = number.get(mesh["name"], len(textured))
+    materials = [_material(link.name, i) for i, link in enumerate(textured)]
+    if len(textured) < len(asset.links):
+        materials.append(_material("scan"))
     document = {
         "asset": {"version": "2.0", "generator": "p2gs"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": nodes,
         "meshes": meshes,
-        "materials": [_material(link.name, i) for i, link in enumerate(textured)] + [_material("scan")],
+        "materials": materials,
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": len(buffer.data)}],

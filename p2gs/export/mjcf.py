@@ -31,12 +31,10 @@ def write_mjcf(asset: Asset, out: Path) -> Path:
         for i in range(len(link.collision)):
             ET.SubElement(meshes, "mesh", name=f"{link.name}_{i}", file=collision_name(link, i), inertia="convex")
     base = _body(world, asset.links[0])
-    contact, actuator = ET.SubElement(root, "contact"), ET.SubElement(root, "actuator")
+    actuator = ET.SubElement(root, "actuator")
     for link in asset.moving:
         _body(base, link)
         ET.SubElement(actuator, "motor", name=f"motor_{link.part}", joint=f"joint_{link.part}", gear="1")
-    for a, b in asset.overlapping:
-        ET.SubElement(contact, "exclude", body1=a, body2=b)
     path = out / "twin.xml"
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n")
@@ -66,6 +64,7 @@ def _body(parent: ET.Element, link: Link) -> ET.Element:
             body, "joint", {"class": "joint"}, name=f"joint_{link.part}", type=kind, pos="0 0 0", axis=numbers(hinge.axis)
         )
         joint.attrib |= {"range": numbers((hinge.lower, hinge.upper)), "damping": number(hinge.damping), "armature": number(0.01 * weight)}
+        joint.attrib["frictionloss"] = number(hinge.friction)
     look = {"rgba": numbers((*link.colour, 1.0))} if link.texture is None else {"material": link.name}
     ET.SubElement(body, "geom", {"class": "visual"} | look, mesh=link.name)
     for i in range(len(link.collision)):

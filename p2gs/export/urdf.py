@@ -59,7 +59,7 @@ def _joint(robot: ET.Element, link: Link, parent: str) -> None:
     ET.SubElement(joint, "axis", xyz=numbers(hinge.axis))
     limits = {"lower": number(hinge.lower), "upper": number(hinge.upper), "effort": number(EFFORT), "velocity": number(VELOCITY)}
     ET.SubElement(joint, "limit", limits)
-    ET.SubElement(joint, "dynamics", damping=number(hinge.damping), friction="0")
+    ET.SubElement(joint, "dynamics", damping=number(hinge.damping), friction=number(hinge.friction))
 
 
 def number(value: float) -> str:

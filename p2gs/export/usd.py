@@ -8,6 +8,7 @@ import numpy as np
 
 from p2gs.export.asset import Asset, Hinge, Link
 from p2gs.export.assets_dir import texture_name
+from p2gs.export.tsdf import vertex_normals
 from p2gs.types import UserError
 
 TEXTURES = "textures"  # folder beside the stage
@@ -112,6 +113,10 @@ def _material(link: Link) -> list[str]:
 def _mesh(name: str, vertices: np.ndarray, faces: np.ndarray, extra: list[str], schemas: str = "") -> list[str]:
     rows = [
         f"point3f[] points = {_array(vertices, 7)}",
+        f"float3[] extent = {_array(np.array([vertices.min(0), vertices.max(0)]), 9)}",
+        f"normal3f[] normals = {_array(vertex_normals(vertices, faces), 4)} (",
+        '    interpolation = "vertex"',
+        ")",
         f"int[] faceVertexCounts = [{', '.join(['3'] * len(faces))}]",
         f"int[] faceVertexIndices = [{', '.join(map(str, faces.reshape(-1)))}]",
         'uniform token subdivisionScheme = "none"',

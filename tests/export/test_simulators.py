@@ -9,10 +9,11 @@ import struct
 import numpy as np
 import pytest
 import trimesh
+from solids import intersect
 from toy import toy_scene, toy_twin
 
 from p2gs.export.asset import cluster, inertia_of, load_asset, placement, simplify
-from p2gs.export.convex import Piece, decompose, hull, intersect
+from p2gs.export.convex import Piece, decompose, hull
 from p2gs.export.formats import EXPORTERS, export_run
 from p2gs.export.glb import glb_bytes
 from p2gs.export.run_folder import write_twin
