@@ -18,7 +18,8 @@ COLUMNS, ROWS, MARKER, GAP = 4, 3, 0.040, 0.010  # metres
 DPI = 300
 MIN_CORNERS = 8  # two markers: one alone fixes the scale to a per cent at best
 FITS = 0.05  # rms of the corners over the board's diagonal: more and the sheet was not flat, or is another board
-SMALL = 1600  # px: photographs below it are doubled before markers are sought, which are a dozen pixels wide from across a room
+SMALL = 2400  # px: smaller photographs are enlarged before markers are sought, which are a dozen pixels wide from across a room
+MIN_SIGHTINGS = 4  # markers over all photographs: textures that look like one do so once
 
 
 def template() -> dict[int, np.ndarray]:
@@ -68,21 +69,39 @@ def write_board(path: Path) -> None:
         raise UserError(f"{path}: the board cannot be written ({err}); expected a name that ends in .pdf or .png") from err
 
 
-def find_markers(path: Path) -> dict[int, np.ndarray]:
-    """Marker id -> [4, 2] corners in pixels (centres at +0.5) of the board's markers in a photograph."""
+def find_markers(path: Path, mirrored: bool = False) -> dict[int, np.ndarray]:
+    """Marker id -> [4, 2] corners in pixels (centres at +0.5) of the board's markers in a photograph.
+
+    mirrored: of a sheet printed (or rendered) mirror-wise; a plane turned over has the same corners, so nothing else changes.
+    """
     import cv2
 
     grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    factor = 2 if max(grey.shape) <= SMALL else 1
+    factor = max(1, round(SMALL / max(grey.shape)))
     if factor > 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    grey = np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey
     options = cv2.aruco.DetectorParameters()
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    options.minMarkerPerimeterRate = 0.012  # of the long edge: a marker 3 thousandths wide is what can be read at all
+    options.perspectiveRemovePixelPerCell = 8
     corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(), options).detectMarkers(grey)
-    if ids is None:
-        return {}
-    known = template()
-    return {int(k): (c.reshape(4, 2) + 0.5) / factor for k, c in zip(np.ravel(ids), corners, strict=True) if int(k) in known}
+    known, out = template(), {}
+    for key, c in zip([] if ids is None else np.ravel(ids), corners, strict=True):
+        c = c.reshape(4, 2) + 0.5
+        c = np.stack([grey.shape[1] - c[:, 0], c[:, 1]], 1) if mirrored else c
+        if int(key) in known:
+            out[int(key)] = c / factor
+    return out
+
+
+def find_board(names: list[str], folder: Path) -> dict[str, dict[int, np.ndarray]]:
+    """Photograph's name -> its markers, of the photographs that show any; mirror images where nearly none shows right ones."""
+    for mirrored in (False, True):
+        seen = {name: markers for name in names if (markers := find_markers(folder / name, mirrored))}
+        if sum(map(len, seen.values())) >= MIN_SIGHTINGS:
+            return seen
+    return {}
 
 
 def corner_id(marker: int, corner: int) -> int:
