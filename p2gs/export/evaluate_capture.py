@@ -15,6 +15,7 @@ import torch
 
 from p2gs.data.capture.model import similarity
 from p2gs.data.ground_truth import parse_joint
+from p2gs.export.evaluate import scene_folder
 from p2gs.export.twin_json import load_twin
 from p2gs.metrics.joints import evaluate_joints
 from p2gs.types import Joint, UserError
@@ -77,11 +78,9 @@ def evaluate_capture(run: Path | str, truth: Path | str, root: Optional[Path | s
 
     truth: folder with cameras.json, trans.json and meshes. Raises UserError, naming the file, where one is missing.
     """
-    from p2gs.config import load_config
-
     run, truth = Path(run), Path(truth)
     truth = truth / "gt" if (truth / "gt").is_dir() else truth
-    scene = Path(root) if root is not None else Path(load_config([str(run / "config.yaml")], []).data.root)
+    scene = Path(root) if root is not None else scene_folder(run)
     pairs = camera_pairs(scene, truth)
     T = rigid_between(*pairs["start"], with_scale=True)
     end_own, end_true = pairs["end"]

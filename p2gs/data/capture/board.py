@@ -96,12 +96,13 @@ def find_markers(path: Path, mirrored: bool = False) -> dict[int, np.ndarray]:
 
 
 def find_board(names: list[str], folder: Path) -> dict[str, dict[int, np.ndarray]]:
-    """Photograph's name -> its markers, of the photographs that show any; mirror images where nearly none shows right ones."""
+    """Photograph's name -> its markers, of the photographs that show any; read as they are or mirror-wise, whichever finds more."""
+    best: dict[str, dict[int, np.ndarray]] = {}
     for mirrored in (False, True):
         seen = {name: markers for name in names if (markers := find_markers(folder / name, mirrored))}
-        if sum(map(len, seen.values())) >= MIN_SIGHTINGS:
-            return seen
-    return {}
+        if sum(map(len, seen.values())) > sum(map(len, best.values())):
+            best = seen
+    return best if sum(map(len, best.values())) >= MIN_SIGHTINGS else {}
 
 
 def corner_id(marker: int, corner: int) -> int:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from p2gs.data.capture.photos import Shot
+from p2gs.data.capture.photos import MIN_PHOTOS, Shot
 from p2gs.types import UserError
 
 SUFFIXES = (".png", ".PNG", ".jpg", ".jpg.png", ".jpeg.png", ".JPG.png", ".webp")
@@ -47,8 +47,6 @@ def read_mask(path: Path, shot: Shot, ignore: bool) -> np.ndarray:
         raise UserError(f"{path}: is {width}x{height} pixels, which is not the shape of {shot.source} ({shot.width}x{shot.height} upright)")
     if (height, width) != (shot.height, shot.width):
         mask = cv2.resize(mask, (shot.width, shot.height), interpolation=cv2.INTER_AREA)
-    if not (mask > 127).any():
-        raise UserError(f"{path}: mask is empty, no pixel belongs to the object")
     return mask
 
 
@@ -58,11 +56,24 @@ def alpha_masks(shots: list[Shot], folder: Path) -> dict[str, np.ndarray] | None
 
     if not all(s.alpha for s in shots):
         return None
-    return {s.name: cv2.imread(str(folder / s.alpha), cv2.IMREAD_GRAYSCALE) for s in shots}
+    return shown({s.name: cv2.imread(str(folder / s.alpha), cv2.IMREAD_GRAYSCALE) for s in shots}, folder)
 
 
 def folder_masks(shots: list[Shot], folder: Path, ignore: bool = False) -> dict[str, np.ndarray]:
-    """The masks in a folder by photograph's name. Raises UserError where one is missing."""
+    """The masks in a folder by photograph's name. Raises UserError where a file is missing.
+
+    A mask without a white pixel says that its photograph does not show the object: it helps to place the others and is not trained on.
+    """
     if not folder.is_dir():
         raise UserError(f"{folder}: there is no such folder of masks")
-    return {s.name: read_mask(mask_file(folder, s), s, ignore) for s in shots}
+    return shown({s.name: read_mask(mask_file(folder, s), s, ignore) for s in shots}, folder)
+
+
+def shown(masks: dict[str, np.ndarray], where: Path) -> dict[str, np.ndarray]:
+    """The masks with something white in them. Raises UserError where a state has fewer than ``MIN_PHOTOS`` of them."""
+    out = {name: mask for name, mask in masks.items() if (mask > 127).any()}
+    for state in STATES:
+        left, of = (sum(n.startswith(state) for n in names) for names in (out, masks))
+        if left < MIN_PHOTOS:
+            raise UserError(f"{where}: state '{state}': {of - left} of {of} masks are empty, expected at least {MIN_PHOTOS} with white pixels")
+    return out

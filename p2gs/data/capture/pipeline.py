@@ -98,6 +98,8 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     progress("writing")
     files = write.write_scene(model, work / "photos", masks, found, out)
     box = _object_box(model, masks)
+    left_out |= {s.name: (s.source, "its mask is empty") for s in shots if s.name not in masks}
+    shots = [s for s in shots if s.name in masks]
     facts |= _facts(model, shots, left_out, files, found, box)
     (out / "capture.json").write_text(json.dumps(facts, indent=1))
     page.write_page(out, model, box, facts)
@@ -229,15 +231,14 @@ def _placed(model: Model, corners: dict[int, int], masks: dict[str, np.ndarray],
 
 def _object_box(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
     """[2, 3] corners of the object by its masks, in the model's coordinates."""
+    import cv2
     import torch
 
     from p2gs.data.box import object_box
     from p2gs.types import Camera, View
 
-    import cv2
-
     views = []
-    for photo in model.photos.values():
+    for photo in (p for p in model.photos.values() if p.name in masks):
         lens = model.lenses[photo.lens]
         pinhole = write.pinhole_of(lens)
         alpha = cv2.remap(masks[photo.name], *pinhole.maps, cv2.INTER_NEAREST)
@@ -266,6 +267,6 @@ def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, bo
         },
         "share_of_points_in_both_states": float(seen.all(1).mean()) if len(seen) else 0.0,
         "lenses": {str(k): {**asdict(lens), "params": lens.params.tolist()} for k, lens in model.lenses.items()},
-        "gains": {files[p.name]: np.exp(found[k]).round(4).tolist() for k, p in model.photos.items()},
+        "gains": {files[p.name]: np.exp(found[k]).round(4).tolist() for k, p in model.photos.items() if p.name in files},
         "object_box": box.tolist(),
     }  # fmt: skip

@@ -42,13 +42,15 @@ def pinhole_of(lens: Lens) -> Pinhole:
 def write_scene(model: Model, photos: Path, masks: dict[str, np.ndarray], gains: dict[int, np.ndarray], out: Path) -> dict[str, str]:
     """Write everything; returns photograph's name -> file below ``out``.
 
-    model: in scene coordinates, photographs named as the copies in ``photos``.  masks: [H, W] uint8 by name.  gains: see ``gains``.
+    model: in scene coordinates, photographs named as the copies in ``photos``.  masks: [H, W] uint8 by name; a photograph without one is left out.  gains: see ``gains``.
     """
     import cv2
 
     pinholes = {key: pinhole_of(lens) for key, lens in model.lenses.items()}
     files, frames, flat = {}, {s: [] for s in STATES}, {}
     for key, photo in sorted(model.photos.items(), key=lambda kv: kv[1].name):
+        if photo.name not in masks:
+            continue
         state = photo.name.split("/")[0]
         pinhole, lens = pinholes[photo.lens], model.lenses[photo.lens]
         image = cv2.imread(str(photos / photo.name))[..., ::-1]
@@ -77,5 +79,7 @@ def write_scene(model: Model, photos: Path, masks: dict[str, np.ndarray], gains:
         (out / state / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": own}, indent=1))
     lenses = {k: Lens("PINHOLE", model.lenses[k].width, model.lenses[k].height, np.array([p.K[0, 0], p.K[1, 1], p.K[0, 2], p.K[1, 2]]))
               for k, p in pinholes.items()}  # fmt: skip
-    write_model(Model(lenses, flat, model.ids, model.xyz, model.rgb), out / "sparse/0")
+    used = np.unique(np.concatenate([p.point for p in flat.values()]))
+    keep = np.isin(model.ids, used)
+    write_model(Model(lenses, flat, model.ids[keep], model.xyz[keep], model.rgb[keep]), out / "sparse/0")
     return files
