@@ -109,7 +109,7 @@ def parser(prog: str = "p2gs") -> Parser:
     capture.add_argument("start", metavar="SHUT", help="folder of photographs of the first state, or a video")
     capture.add_argument("end", metavar="OPEN", help="the same of the second state; nothing but the parts may have moved")
     capture.add_argument("--out", required=True, metavar="SCENE", help="folder to write")
-    capture.add_argument("--masks", metavar="DIR", help="masks of the object, white = object (default: the photographs' alpha)")
+    capture.add_argument("--masks", metavar="DIR", help="masks of the object, white = object (default: alpha, else from 3D)")
     capture.add_argument("--mask_means", "--mask-means", choices=("object", "ignore"), default="object", help="ignore: nerfstudio's masks")
     capture.add_argument("--poses", metavar="PATH", help="a COLMAP model or transforms.json of both states: no structure from motion")
     capture.add_argument("--static", type=int, metavar="N", help="which hypothesis of capture.json is the room (default: the widest)")

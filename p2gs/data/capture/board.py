@@ -158,16 +158,24 @@ def _meet(rays: list) -> np.ndarray | None:
 
 
 def board_pose(model: Model, points: dict[int, int]) -> tuple[np.ndarray, float] | None:
-    """([4, 4] similarity metres -> model, rms in metres) of the board by its corners; None where too few are there or they do not fit."""
-    known = template()
-    corners = [c for c, key in points.items() if key in set(model.ids.tolist())]
-    if len(corners) < MIN_CORNERS:
+    """([4, 4] similarity metres -> model, weighted rms in metres) of the board; None where too few markers are whole or they do not fit."""
+    known, there = template(), set(model.ids.tolist())
+    whole = [m for m in known if all(points.get(corner_id(m, c)) in there for c in range(4))]
+    if 4 * len(whole) < MIN_CORNERS:
         return None
-    flat = np.array([known[c // 4][c % 4] for c in corners])
-    found = model.xyz[np.searchsorted(model.ids, [points[c] for c in corners])]
-    T = similarity(flat, found)
-    scale = np.cbrt(np.linalg.det(T[:3, :3]))
-    rms = float(np.sqrt(((flat @ T[:3, :3].T + T[:3, 3] - found) ** 2).sum(1).mean()) / scale)
+    # centres: a corner creeps inwards where white bleeds into black, a marker's centre does not
+    flat = np.array([known[m].mean(0) for m in whole])
+    rows = np.searchsorted(model.ids, [[points[corner_id(m, c)] for c in range(4)] for m in whole])
+    found = model.xyz[rows].mean(1)
+    if len(whole) == 2:  # two centres are a line: all corners, then
+        flat, found = np.concatenate([known[m] for m in whole]), model.xyz[rows].reshape(-1, 3)
+    weight = np.ones(len(flat))
+    for _ in range(8):  # a marker read wrongly must not stretch the rest
+        T = similarity(flat, found, weight)
+        scale = np.cbrt(np.linalg.det(T[:3, :3]))
+        off = np.linalg.norm(flat @ T[:3, :3].T + T[:3, 3] - found, axis=1) / scale
+        weight = 1 / (1 + (off / (np.median(off) + 1e-6)) ** 2)
+    rms = float(np.sqrt((weight * off**2).sum() / weight.sum()))
     diagonal = float(np.hypot(COLUMNS, ROWS) * (MARKER + GAP))
     return (T, rms) if rms < FITS * diagonal else None
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from p2gs.data.capture import board as marker_board
 from p2gs.data.capture import frame, gains, given_masks, page, poses, write
+from p2gs.data.capture.auto_masks import auto_masks
 from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
 from p2gs.data.capture.hypotheses import Hypothesis, State
@@ -91,10 +92,14 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
         model, corners, facts = _solved(shots, work, cache, options, progress)
     for state in STATES:
         _check_arc(model, state)
-    model, about = _placed(model, corners, masks, options)
-    facts |= about
     progress("exposure and white balance")
     found = gains.photo_gains(model, work / "photos")
+    model, about = _oriented(model, corners)
+    if masks is None:
+        masks = auto_masks(model, work / "photos", found, progress)
+        _keep(masks, out / "masks")
+    model = _scaled(model, masks, options, about)
+    facts |= about | {"masks": "given" if options.masks else "alpha" if shots[0].alpha else "auto"}
     progress("writing")
     files = write.write_scene(model, work / "photos", masks, found, out)
     box = _object_box(model, masks)
@@ -129,16 +134,21 @@ def _photos(sources: dict[str, Path], work: Path, cache: Cache, options: Options
     return shots, left_out
 
 
-def _masks(shots: list[Shot], folder: Path, options: Options) -> dict[str, np.ndarray]:
+def _masks(shots: list[Shot], folder: Path, options: Options) -> Optional[dict[str, np.ndarray]]:
+    """Masks that are there already, or None: to be made from 3D."""
     if options.masks is not None:
         return given_masks.folder_masks(shots, options.masks, options.ignore)
-    masks = given_masks.alpha_masks(shots, folder)
-    if masks is None:
-        raise UserError(
-            f"{Path(shots[0].source).parent}: the photographs have no alpha, so nothing says where the object is; "
-            "give --masks DIR with a mask for each, white where the object is"
-        )
-    return masks
+    return given_masks.alpha_masks(shots, folder)
+
+
+def _keep(masks: dict[str, np.ndarray], folder: Path) -> None:
+    """As PNGs that can be edited and given back with --masks."""
+    import cv2
+
+    for name, mask in masks.items():
+        path = (folder / name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), mask)
 
 
 def _reconstructed(state: str, shots: list[Shot], work: Path, cache: Cache, careful: bool, progress: Progress) -> State:
@@ -207,8 +217,8 @@ def _check_arc(model: Model, state: str) -> None:
                         "walk from one side of the front to the other, at two or three heights")  # fmt: skip
 
 
-def _placed(model: Model, corners: dict[int, int], masks: dict[str, np.ndarray], options: Options) -> tuple[Model, dict]:
-    """The model with z up, the floor at 0 and a scale; what was used for it."""
+def _oriented(model: Model, corners: dict[int, int]) -> tuple[Model, dict]:
+    """The model with z up, the floor at 0 and, where there is a board, in metres; what was used for it."""
     floor, pose = frame.floor_of(model), marker_board.board_pose(model, corners)
     metres, source, about = 1.0, "object diagonal", {}
     if pose is not None:
@@ -219,14 +229,20 @@ def _placed(model: Model, corners: dict[int, int], masks: dict[str, np.ndarray],
         if normal @ floor.normal < np.cos(np.radians(5)) or floor.source == "cameras":  # two measures of one floor: the larger plane is better
             floor = frame.Floor(normal, float(normal @ T[:3, 3]), "board")
         about["board_rms_mm"] = round(1000 * rms, 2)
-    model = model.moved(frame.to_world(floor, model, metres))
-    if pose is None:
+    return model.moved(frame.to_world(floor, model, metres)), about | {"scale": {"source": source}, "up": floor.source}
+
+
+def _scaled(model: Model, masks: dict[str, np.ndarray], options: Options, about: dict) -> Model:
+    """The model with the object's height, or else its diagonal of 1, where no board gave metres; notes it in ``about``."""
+    scale = about["scale"]
+    if scale["source"] != "board":
         box = _object_box(model, masks)
         factor = 1 / float(np.linalg.norm(box[1] - box[0]))
         if options.height is not None:
-            factor, source = options.height / float(box[1, 2]), "height"
+            factor, scale["source"] = options.height / float(box[1, 2]), "height"
         model = model.moved(np.diag([factor, factor, factor, 1.0]))
-    return model, about | {"scale": {"source": source, "metric": source != "object diagonal"}, "up": floor.source}
+    scale["metric"] = scale["source"] != "object diagonal"
+    return model
 
 
 def _object_box(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
