@@ -64,7 +64,7 @@ def parser(prog: str = "p2gs") -> Parser:
     test = add("test", "score a run against the scene's ground truth and write metrics.json")
     test.add_argument("run", metavar="RUN", help="result folder of a fit")
     test.add_argument("--root", metavar="DIR", help="the scene's folder, where it has moved since the fit")
-    test.add_argument("--truth", metavar="DIR", help="true cameras, joints and meshes of a capture (cameras.json, trans.json): score in metres")
+    test.add_argument("--truth", metavar="DIR", help="a capture's true cameras, joints and meshes: score in metres")
 
     predict = add("predict", "render a run's twin at any state between start (0) and end (1)")
     predict.add_argument("run", metavar="RUN", help="result folder of a fit")
@@ -110,7 +110,8 @@ def parser(prog: str = "p2gs") -> Parser:
     capture.add_argument("end", metavar="OPEN", help="the same of the second state; nothing but the parts may have moved")
     capture.add_argument("--out", required=True, metavar="SCENE", help="folder to write")
     capture.add_argument("--masks", metavar="DIR", help="masks of the object, white = object (default: alpha, else from 3D)")
-    capture.add_argument("--mask_means", "--mask-means", choices=("object", "ignore"), default="object", help="ignore: nerfstudio's masks")
+    means = {"choices": ("object", "ignore"), "default": "object", "help": "ignore: nerfstudio's masks"}
+    capture.add_argument("--mask_means", "--mask-means", **means)
     capture.add_argument("--poses", metavar="PATH", help="a COLMAP model or transforms.json of both states: no structure from motion")
     capture.add_argument("--static", type=int, metavar="N", help="which hypothesis of capture.json is the room (default: the widest)")
     capture.add_argument("--height", type=float, metavar="M", help="height of the object above the floor in metres, where there is no board")

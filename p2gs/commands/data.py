@@ -1,4 +1,6 @@
-"""The commands on scene folders: ``p2gs data check``, ``synth``, ``prepare``, ``capture`` and ``board``. Each takes the parsed arguments, returns the exit code."""
+"""The commands on scene folders: ``p2gs data check``, ``synth``, ``prepare``, ``capture`` and ``board``.
+
+Each takes the parsed arguments, returns the exit code."""
 
 from __future__ import annotations
 

@@ -41,7 +41,9 @@ def camera_pairs(scene: Path, truth: Path) -> dict[str, tuple[np.ndarray, np.nda
             if key in true:
                 own.append(frame["transform_matrix"]), other.append(true[key])
         if len(own) < 3:
-            raise UserError(f"{truth / 'cameras.json'}: knows {len(own)} photographs of state '{state}', expected at least 3")
+            raise UserError(
+                f"{truth / 'cameras.json'}: knows {len(own)} photographs of state '{state}', expected at least 3"
+            )
         out[state] = (np.array(own, float), np.array(other, float))
     return out
 
@@ -90,7 +92,10 @@ def evaluate_capture(run: Path | str, truth: Path | str, root: Optional[Path | s
     points = base_points(truth)
     off = None if points is None else np.linalg.norm(points @ D[:3, :3].T + D[:3, 3] - points, axis=1)
     info = _json(truth / "trans.json")["trans_info"]
-    true = [parse_joint(e, f"{truth / 'trans.json'}: joint {i}") for i, e in enumerate(info if isinstance(info, list) else [info])]
+    true = [
+        parse_joint(e, f"{truth / 'trans.json'}: joint {i}")
+        for i, e in enumerate(info if isinstance(info, list) else [info])
+    ]
     found = [moved_joint(p.joint, T) for p in load_twin(run).parts if p.joint is not None]
     report = evaluate_joints(found, true)
     result = {
@@ -109,7 +114,10 @@ def capture_lines(result: dict) -> list[str]:
     for j in joints["joints"]:
         e = j["errors"]
         if e is None:
-            lines.append(f"joint {j['gt'] + 1} ({j['type']}): F, " + ("not found" if j["pred"] is None else f"found as {j['pred_type']}"))
+            lines.append(
+                f"joint {j['gt'] + 1} ({j['type']}): F, "
+                + ("not found" if j["pred"] is None else f"found as {j['pred_type']}")
+            )
             continue
         place = "" if e["axis_position"] is None else f", axis {100 * e['axis_position']:.1f} mm off"
         motion = f"{e['motion']:.2f} deg" if j["type"] == "revolute" else f"{1000 * e['motion']:.1f} mm"

@@ -43,10 +43,18 @@ def test_the_object_is_told_from_the_room():
     for i, angle in enumerate(np.linspace(-1.2, 1.2, 18)):
         view = look_at(np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), (0.6, 1.1, 1.6)[i % 3]]), (0, 0, 0.35))
         shot = render(primitives, parts, view, K, 128, 96, samples=1)
-        pictures.append(Picture(Camera(torch.tensor(view).float(), torch.tensor(K).float(), 128, 96), torch.from_numpy(shot.image).float() / 255))
+        pictures.append(
+            Picture(
+                Camera(torch.tensor(view).float(), torch.tensor(K).float(), 128, 96),
+                torch.from_numpy(shot.image).float() / 255,
+            )
+        )
         truths.append(shot.parts == 1)
         v, u = np.nonzero((shot.depth > 0) & (np.random.default_rng(i).random(shot.depth.shape) < 0.01))
-        local = np.stack([(u + 0.5 - K[0, 2]) / K[0, 0], (v + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(u))], 1) * shot.depth[v, u, None]
+        local = (
+            np.stack([(u + 0.5 - K[0, 2]) / K[0, 0], (v + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(u))], 1)
+            * shot.depth[v, u, None]
+        )
         points.append((local - view[:3, 3]) @ view[:3, :3])
     xyz = np.concatenate(points)
     cameras = np.array([p.camera.position.numpy() for p in pictures])
@@ -65,7 +73,9 @@ def test_the_object_is_told_from_the_room():
 
 
 def test_sharpening_moves_an_edge_to_the_picture_and_not_further():
-    image = np.full((90, 120, 3), 60, np.uint8) + np.random.default_rng(0).integers(0, 12, (90, 120, 3)).astype(np.uint8)
+    image = np.full((90, 120, 3), 60, np.uint8) + np.random.default_rng(0).integers(0, 12, (90, 120, 3)).astype(
+        np.uint8
+    )
     image[20:70, 30:90] += 120
     share = np.zeros((90, 120))
     share[22:70, 30:88] = 1  # two pixels short at two sides
@@ -93,7 +103,11 @@ def test_a_mask_goes_back_through_the_lens():
 
 
 def shots(count=8):
-    return [Shot(f"{s}/{i:04d}.jpg", f"/x/{s}/IMG_{i}.jpg", 40, 30, None, "", 1.0) for s in ("start", "end") for i in range(count)]
+    return [
+        Shot(f"{s}/{i:04d}.jpg", f"/x/{s}/IMG_{i}.jpg", 40, 30, None, "", 1.0)
+        for s in ("start", "end")
+        for i in range(count)
+    ]
 
 
 def test_given_masks_are_found_by_name_and_scaled(tmp_path):

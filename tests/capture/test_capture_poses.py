@@ -31,12 +31,16 @@ def small_model(per_state=8, points=60, names="{state}/{i}.jpg"):
     rng = np.random.default_rng(0)
     xyz = rng.uniform(-1.5, 1.5, (points, 3))
     photos, key = {}, 0
-    model = Model({3: LENS}, photos, np.arange(10, 10 + points), xyz, rng.integers(0, 255, (points, 3)).astype(np.uint8))
+    model = Model(
+        {3: LENS}, photos, np.arange(10, 10 + points), xyz, rng.integers(0, 255, (points, 3)).astype(np.uint8)
+    )
     for s, state in enumerate(("start", "end")):
         for i in range(per_state):
             key += 1
             angle = 2.4 * i / per_state - 1.2 + 0.05 * s
-            photos[key] = Photo(names.format(state=state, i=i), 3, look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.2])))
+            photos[key] = Photo(
+                names.format(state=state, i=i), 3, look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.2]))
+            )
             pixels = model.pixels_of(key, xyz)
             inside = (pixels > 0).all(1) & (pixels < [320, 240]).all(1)
             photos[key].xy, photos[key].point = pixels[inside], model.ids[inside]
@@ -57,12 +61,17 @@ def same(a: Model, b: Model):
 
 def write_text(model, folder):
     folder.mkdir()
-    lines = ["# cameras"] + [f"{k} {c.model} {c.width} {c.height} " + " ".join(map(repr, map(float, c.params))) for k, c in model.lenses.items()]
+    lines = ["# cameras"] + [
+        f"{k} {c.model} {c.width} {c.height} " + " ".join(map(repr, map(float, c.params)))
+        for k, c in model.lenses.items()
+    ]
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
     lines = ["# images"]
     for key, p in model.photos.items():
         quat = np.roll(Rotation.from_matrix(p.viewmat[:3, :3]).as_quat(), 1)
-        lines.append(" ".join(map(repr, [key, *map(float, quat), *map(float, p.viewmat[:3, 3]), p.lens])) + f" {p.name}")
+        lines.append(
+            " ".join(map(repr, [key, *map(float, quat), *map(float, p.viewmat[:3, 3]), p.lens])) + f" {p.name}"
+        )
         lines.append(" ".join(f"{float(x)!r} {float(y)!r} {i}" for (x, y), i in zip(p.xy, p.point, strict=True)))
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     rows = [f"{i} " + " ".join(map(repr, map(float, x))) + " " + " ".join(map(str, c)) + " 0.5"
@@ -111,11 +120,18 @@ def transforms(model, applied=None):
         c2w[:3, 1:3] *= -1
         frames.append({"file_path": p.name, "transform_matrix": (A @ c2w).tolist()})
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
-    meta = dict(zip(names, map(float, LENS.params), strict=True)) | {"w": 320, "h": 240, "camera_model": "OPENCV", "frames": frames}
+    meta = dict(zip(names, map(float, LENS.params), strict=True)) | {
+        "w": 320,
+        "h": 240,
+        "camera_model": "OPENCV",
+        "frames": frames,
+    }
     return meta | ({} if applied is None else {"applied_transform": applied})
 
 
-@pytest.mark.parametrize("applied", [None, [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], [[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 3]]])
+@pytest.mark.parametrize(
+    "applied", [None, [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], [[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 3]]]
+)
 def test_nerfstudio_poses_come_back_to_their_own_frame(tmp_path, applied):
     model = small_model()
     (tmp_path / "transforms.json").write_text(json.dumps(transforms(model, applied)))

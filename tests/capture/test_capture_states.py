@@ -38,24 +38,41 @@ def reconstruction(xyz, descriptors, state, seed, T=None, noise=0.3):
     model = Model({1: LENS}, photos, np.arange(1, len(xyz) + 1), xyz, np.zeros((len(xyz), 3), np.uint8))
     for i, angle in enumerate(np.linspace(-1.1, 1.1, 16)):
         height = (0.5, 1.0, 1.5)[i % 3]
-        photos[i + 1] = Photo(f"{state}/{i:04d}.jpg", 1, look_at(np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), height]), (0, 0, 0.45)))
+        photos[i + 1] = Photo(
+            f"{state}/{i:04d}.jpg",
+            1,
+            look_at(np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), height]), (0, 0, 0.45)),
+        )
         pixels = model.pixels_of(i + 1, xyz)
         inside = np.isfinite(pixels).all(1) & (pixels > 0).all(1) & (pixels < [960, 720]).all(1)
-        photos[i + 1].xy, photos[i + 1].point = pixels[inside] + noise * rng.normal(size=(inside.sum(), 2)), model.ids[inside]
+        photos[i + 1].xy, photos[i + 1].point = (
+            pixels[inside] + noise * rng.normal(size=(inside.sum(), 2)),
+            model.ids[inside],
+        )
     counts = np.bincount(model.observations()[0], minlength=len(xyz))
     keep = counts >= 3
     for p in photos.values():
         p.point = np.where(np.isin(p.point, model.ids[keep]), p.point, -1)
-    model = Model({1: LENS}, photos, model.ids[keep], xyz[keep] + 0.002 * rng.normal(size=(keep.sum(), 3)), model.rgb[keep])
+    model = Model(
+        {1: LENS}, photos, model.ids[keep], xyz[keep] + 0.002 * rng.normal(size=(keep.sum(), 3)), model.rgb[keep]
+    )
     return State(model if T is None else model.moved(T), descriptors[keep])
 
 
 def two_states(room: int, drawer: int, board=False):
     """A room (floor and wall) with ``room`` points, a drawer's front with ``drawer``, which comes out by ``DRAWER_MOTION``."""
     rng = np.random.default_rng(3)
-    floor = np.c_[rng.uniform(-1.2, 1.6, (room // 2, 1)), rng.uniform(-1.5, 1.5, (room // 2, 1)), np.zeros((room // 2, 1))]
-    wall = np.c_[np.full((room - room // 2, 1), -1.0), rng.uniform(-1.5, 1.5, (room - room // 2, 1)), rng.uniform(0, 2, (room - room // 2, 1))]
-    front = np.c_[np.full((drawer, 1), 0.3), rng.uniform(-0.25, 0.25, (drawer, 1)), rng.uniform(0.35, 0.55, (drawer, 1))]
+    floor = np.c_[
+        rng.uniform(-1.2, 1.6, (room // 2, 1)), rng.uniform(-1.5, 1.5, (room // 2, 1)), np.zeros((room // 2, 1))
+    ]
+    wall = np.c_[
+        np.full((room - room // 2, 1), -1.0),
+        rng.uniform(-1.5, 1.5, (room - room // 2, 1)),
+        rng.uniform(0, 2, (room - room // 2, 1)),
+    ]
+    front = np.c_[
+        np.full((drawer, 1), 0.3), rng.uniform(-0.25, 0.25, (drawer, 1)), rng.uniform(0.35, 0.55, (drawer, 1))
+    ]
     xyz = np.concatenate([floor, wall, front])
     moves = np.arange(len(xyz)) >= room
     d = np.abs(rng.normal(size=(len(xyz), 128))).astype(np.float32) ** 3
@@ -147,7 +164,9 @@ def test_the_board_gives_scale_and_up(tmp_path, mirrored):
     per_pixel = 0.0254 / 300 * 2.5  # model units a pixel: the model's unit is 0.4 m
     lens = Lens("PINHOLE", 960, 720, np.array([900.0, 900, 480, 360]))
     photos = {}
-    to_plane = np.array([[per_pixel, 0, -sheet.shape[1] / 2 * per_pixel], [0, -per_pixel, sheet.shape[0] / 2 * per_pixel], [0, 0, 1]])
+    to_plane = np.array(
+        [[per_pixel, 0, -sheet.shape[1] / 2 * per_pixel], [0, -per_pixel, sheet.shape[0] / 2 * per_pixel], [0, 0, 1]]
+    )
     for i, angle in enumerate(np.linspace(-1, 1, 6)):
         view = look_at(np.array([2.0 * np.cos(angle), 2.0 * np.sin(angle), 1.5]), (0, 0, 0))
         H = lens.K @ view[:3][:, [0, 1, 3]] @ to_plane

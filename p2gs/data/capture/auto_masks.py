@@ -19,6 +19,7 @@ COARSE = 200  # px, long edge of the splat's pictures
 SHARP = 480  # px, long edge that edges are sharpened at
 BAND = 0.012  # of the long edge, to either side of the drawn edge: two pixels of the splat's pictures
 IN_HULL = 0.93  # share of the photographs that must show a point within the outline; a ragged coarse outline misses some at its edge
+PORE = 0.03  # of the mask: smaller holes are the coarse splat's, where a plain side gave it nothing to hold on to
 CHANGED = 0.15  # share of the mask that sharpening may change before it is not believed
 
 
@@ -54,9 +55,28 @@ def sharpened(image: np.ndarray, share: np.ndarray) -> np.ndarray:
     labels = np.where(drawn > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[inner > 0], labels[outer == 0] = cv2.GC_FGD, cv2.GC_BGD
     cv2.setRNGSeed(0)
-    cv2.grabCut(np.ascontiguousarray(image[..., ::-1]), labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 3, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(
+        np.ascontiguousarray(image[..., ::-1]),
+        labels,
+        None,
+        np.zeros((1, 65)),
+        np.zeros((1, 65)),
+        3,
+        cv2.GC_INIT_WITH_MASK,
+    )
     cut = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
     return drawn > 0 if (cut != (drawn > 0)).sum() > CHANGED * drawn.sum() else cut
+
+
+def without_pores(mask: np.ndarray) -> np.ndarray:
+    """The mask [h, w] bool with enclosed holes below ``PORE`` of its area filled."""
+    from scipy.ndimage import binary_fill_holes, label
+
+    holes, count = label(binary_fill_holes(mask) & ~mask)
+    sizes = np.bincount(holes.ravel(), minlength=count + 1)
+    small = sizes < PORE * mask.sum()
+    small[0] = False
+    return mask | small[holes]
 
 
 def enclosed(splat, rows: torch.Tensor, pictures: list[Picture], region: Region) -> torch.Tensor:
@@ -87,7 +107,6 @@ def enclosed(splat, rows: torch.Tensor, pictures: list[Picture], region: Region)
 
 def state_masks(model: Model, photos: Path, gains: dict, region: Region, end: bool) -> dict[str, np.ndarray]:
     """Masks [H, W] uint8 in the copies' (distorted) pixels of one state's photographs, by name."""
-    import cv2
 
     keys = [k for k, p in model.photos.items() if is_end(p.name) == end]
     mine = states_of(model)[:, int(end)]
@@ -95,13 +114,15 @@ def state_masks(model: Model, photos: Path, gains: dict, region: Region, end: bo
     fit(splat, pictures_of(model, photos, gains, keys, COARSE), region.distance)
     rows = object_rows(splat, region)
     if rows.sum() < 50:
-        raise UserError(f"the object could not be told from the room in state '{'end' if end else 'start'}'; give --masks DIR")
+        raise UserError(
+            f"the object could not be told from the room in state '{'end' if end else 'start'}'; give --masks DIR"
+        )
     rows |= enclosed(splat, rows, pictures_of(model, photos, gains, keys, COARSE), region)
     out = {}
     for key, sharp in zip(keys, pictures_of(model, photos, gains, keys, SHARP), strict=True):
         with torch.no_grad():
             share = splat.render(sharp.camera, features=rows[:, None].float()).features[..., 0].numpy()
-        mask = sharpened((255 * sharp.image.numpy()).astype(np.uint8), share)
+        mask = without_pores(sharpened((255 * sharp.image.numpy()).astype(np.uint8), share))
         photo = model.photos[key]
         out[photo.name] = distorted(mask, model.lenses[photo.lens])
         if not out[photo.name].any():
@@ -119,10 +140,14 @@ def distorted(mask: np.ndarray, lens) -> np.ndarray:
     factor = mask.shape[1] / lens.width
     u, v = (rays[..., 0] * K[0, 0] + K[0, 2]) * factor - 0.5, (rays[..., 1] * K[1, 1] + K[1, 2]) * factor - 0.5
     soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.0)
-    return np.where(cv2.remap(soft, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR) > 0.5, 255, 0).astype(np.uint8)
+    return np.where(cv2.remap(soft, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR) > 0.5, 255, 0).astype(
+        np.uint8
+    )
 
 
-def auto_masks(model: Model, photos: Path, gains: dict, progress: Callable[[str], None] = lambda text: None) -> dict[str, np.ndarray]:
+def auto_masks(
+    model: Model, photos: Path, gains: dict, progress: Callable[[str], None] = lambda text: None
+) -> dict[str, np.ndarray]:
     """Masks of both states by photograph's name. model: z up, floor at 0."""
     centre, distance = model.centre()
     centre = np.array([*centre[:2], max(centre[2], 0.1 * distance)])

@@ -66,7 +66,9 @@ def write_board(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(page).save(path, resolution=DPI)
     except (OSError, ValueError) as err:
-        raise UserError(f"{path}: the board cannot be written ({err}); expected a name that ends in .pdf or .png") from err
+        raise UserError(
+            f"{path}: the board cannot be written ({err}); expected a name that ends in .pdf or .png"
+        ) from err
 
 
 def find_markers(path: Path, mirrored: bool = False) -> dict[int, np.ndarray]:
@@ -117,7 +119,10 @@ def with_corners(model: Model, seen: dict[str, dict[int, np.ndarray]]) -> tuple[
     rays: dict[int, list] = {}
     for key, photo in model.photos.items():
         for marker, corners in seen.get(photo.name, {}).items():
-            directions = np.pad(model.lenses[photo.lens].rays(corners), ((0, 0), (0, 1)), constant_values=1.0) @ photo.viewmat[:3, :3]
+            directions = (
+                np.pad(model.lenses[photo.lens].rays(corners), ((0, 0), (0, 1)), constant_values=1.0)
+                @ photo.viewmat[:3, :3]
+            )
             for c in range(4):
                 rays.setdefault(corner_id(marker, c), []).append((key, photo.position, directions[c], corners[c]))
     next_id, ids, xyz, points, added = int(model.ids.max(initial=0)) + 1, [], [], {}, {}

@@ -12,9 +12,8 @@ from pathlib import Path
 from p2gs.types import UserError
 
 NO_PYCOLMAP = 3  # exit code of the child
-HOW_TO_INSTALL = (
-    "structure from motion needs pycolmap: pip install 'p2gs[capture]' (there is no wheel for Linux on ARM: bring poses with --poses)"
-)
+HOW_TO_INSTALL = "structure from motion needs pycolmap: pip install 'p2gs[capture]' "
+    "(there is no wheel for Linux on ARM: bring poses with --poses)"
 
 
 def threads() -> int:
@@ -33,7 +32,10 @@ def run_job(task: str, job: dict, folder: Path, progress: Callable[[str], None] 
     job = {"threads": threads(), "seed": 0, **job, "task": task, "result": str(paths["result"])}
     paths["job"].write_text(json.dumps(job))
     command = [sys.executable, "-m", "p2gs.data.capture.sfm", str(paths["job"])]
-    with open(paths["log"], "w") as log, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True) as child:
+    with (
+        open(paths["log"], "w") as log,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True) as child,
+    ):
         try:
             for line in child.stdout:
                 progress(line.strip())

@@ -40,7 +40,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Region:
-    """Where to look for the object: centre [3], distance of the cameras, planes [n, 4] (normal towards the cameras, offset); z up, floor 0."""
+    """Where to look for the object; z up, floor 0.
+
+    centre: [3].  distance: of the cameras.  planes: [n, 4], normal towards the cameras and offset.
+    """
 
     centre: np.ndarray
     distance: float
@@ -125,7 +128,13 @@ def initial(region: Region, xyz: np.ndarray, rgb: np.ndarray, seed: int = 0) -> 
     quats = torch.zeros(len(points), 4)
     quats[:, 0] = 1
     sh = rgb_to_dc(colours)[:, None].contiguous()
-    params = {"means": points, "quats": quats, "log_scales": scale.log()[:, None].repeat(1, 3), "opacity_logits": opacity, "sh": sh}
+    params = {
+        "means": points,
+        "quats": quats,
+        "log_scales": scale.log()[:, None].repeat(1, 3),
+        "opacity_logits": opacity,
+        "sh": sh,
+    }
     return Splat({k: v.clone().requires_grad_() for k, v in params.items()}, len(cloud))
 
 
@@ -133,7 +142,9 @@ def fit(splat: Splat, pictures: list[Picture], distance: float, steps: int = STE
     """Fit in place; returns the colour behind everything [3]."""
     sky = torch.full((3,), 0.8, requires_grad=True)
     rates = {"means": 2e-3 * distance, "quats": 2e-3, "log_scales": 1e-2, "opacity_logits": 8e-2, "sh": 2e-2}
-    optimizer = torch.optim.Adam([{"params": [splat.params[k]], "lr": r} for k, r in rates.items()] + [{"params": [sky], "lr": 1e-2}], eps=1e-12)
+    optimizer = torch.optim.Adam(
+        [{"params": [splat.params[k]], "lr": r} for k, r in rates.items()] + [{"params": [sky], "lr": 1e-2}], eps=1e-12
+    )
     order = np.random.default_rng(seed)
     for step in range(steps):
         for group in optimizer.param_groups[:1]:

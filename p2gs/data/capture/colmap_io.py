@@ -15,7 +15,15 @@ from scipy.spatial.transform import Rotation
 from p2gs.data.capture.model import LENS_MODELS, Lens, Model, Photo
 from p2gs.types import UserError
 
-MODEL_NAMES = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 5: "OPENCV_FISHEYE", 6: "FULL_OPENCV"}
+MODEL_NAMES = {
+    0: "SIMPLE_PINHOLE",
+    1: "PINHOLE",
+    2: "SIMPLE_RADIAL",
+    3: "RADIAL",
+    4: "OPENCV",
+    5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV",
+}
 MODEL_IDS = {name: i for i, name in MODEL_NAMES.items()}
 
 
@@ -34,7 +42,9 @@ def read_model(folder: Path) -> Model:
     paths = [folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D")]
     for path in paths[:2]:
         if not path.is_file():
-            raise UserError(f"{path}: is missing; a COLMAP model has cameras, images and points3D, all .bin or all .txt")
+            raise UserError(
+                f"{path}: is missing; a COLMAP model has cameras, images and points3D, all .bin or all .txt"
+            )
     readers = (_cameras_bin, _images_bin, _points_bin) if suffix == ".bin" else (_cameras_txt, _images_txt, _points_txt)
     parsed = []
     for path, reader in zip(paths, readers, strict=True):
@@ -45,7 +55,9 @@ def read_model(folder: Path) -> Model:
     lenses, photos, (ids, xyz, rgb) = parsed
     for photo in photos.values():
         if photo.lens not in lenses:
-            raise UserError(f"{paths[1]}: image {photo.name} has camera {photo.lens}, which {paths[0].name} does not list")
+            raise UserError(
+                f"{paths[1]}: image {photo.name} has camera {photo.lens}, which {paths[0].name} does not list"
+            )
         photo.point = np.where(np.isin(photo.point, ids), photo.point, -1)
     order = np.argsort(ids)
     return Model(lenses, photos, ids[order], xyz[order], rgb[order])
@@ -104,7 +116,9 @@ def _images_bin(path: Path) -> dict[int, Photo]:
         key, *pose, lens = file.take("i7di")
         name = file.text()
         points = file.array(dtype, file.take("Q")[0])
-        out[key] = Photo(name, lens, _viewmat(pose[:4], pose[4:]), points["xy"].copy(), points["point"].astype(np.int64))
+        out[key] = Photo(
+            name, lens, _viewmat(pose[:4], pose[4:]), points["xy"].copy(), points["point"].astype(np.int64)
+        )
     return out
 
 
@@ -139,11 +153,15 @@ def _images_txt(path: Path) -> dict[int, Photo]:
     lines, out = _lines(path), {}
     while lines and not lines[0].strip():
         lines.pop(0)
-    for head, tail in zip(lines[::2], [*lines[1::2], ""], strict=False):  # an image without points has an empty second line
+    for head, tail in zip(
+        lines[::2], [*lines[1::2], ""], strict=False
+    ):  # an image without points has an empty second line
         words = head.split(maxsplit=9)
         numbers = np.array(tail.split(), float).reshape(-1, 3)
         viewmat = _viewmat([float(w) for w in words[1:5]], [float(w) for w in words[5:8]])
-        out[int(words[0])] = Photo(words[9].strip(), int(words[8]), viewmat, numbers[:, :2].copy(), numbers[:, 2].astype(np.int64))
+        out[int(words[0])] = Photo(
+            words[9].strip(), int(words[8]), viewmat, numbers[:, :2].copy(), numbers[:, 2].astype(np.int64)
+        )
     return out
 
 
@@ -152,7 +170,11 @@ def _points_txt(path: Path):
         return _no_points()
     rows = [line.split()[:7] for line in filter(str.strip, _lines(path))]
     ids = np.array([int(r[0]) for r in rows], np.int64)
-    return ids, np.array([r[1:4] for r in rows], float).reshape(-1, 3), np.array([r[4:7] for r in rows], np.uint8).reshape(-1, 3)
+    return (
+        ids,
+        np.array([r[1:4] for r in rows], float).reshape(-1, 3),
+        np.array([r[4:7] for r in rows], np.uint8).reshape(-1, 3),
+    )
 
 
 def write_model(model: Model, folder: Path) -> None:
@@ -162,7 +184,10 @@ def write_model(model: Model, folder: Path) -> None:
         (folder / stale).unlink(missing_ok=True)
     out = [struct.pack("<Q", len(model.lenses))]
     for key, lens in model.lenses.items():
-        out.append(struct.pack("<iiQQ", key, MODEL_IDS[lens.model], lens.width, lens.height) + lens.params.astype("<f8").tobytes())
+        out.append(
+            struct.pack("<iiQQ", key, MODEL_IDS[lens.model], lens.width, lens.height)
+            + lens.params.astype("<f8").tobytes()
+        )
     (folder / "cameras.bin").write_bytes(b"".join(out))
     out = [struct.pack("<Q", len(model.photos))]
     for key, photo in model.photos.items():

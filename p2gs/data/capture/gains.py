@@ -80,5 +80,7 @@ def photo_gains(model: Model, folder: Path) -> dict[int, np.ndarray]:
 
 def corrected(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """A photograph [H, W, 3] uint8 RGB with its gain taken out."""
-    table = [np.rint(255 * np.clip(encoded(linear(np.arange(256) / 255) * np.exp(-g)), 0, 1)).astype(np.uint8) for g in gain]
+    table = [
+        np.rint(255 * np.clip(encoded(linear(np.arange(256) / 255) * np.exp(-g)), 0, 1)).astype(np.uint8) for g in gain
+    ]
     return np.stack([t[image[..., c]] for c, t in enumerate(table)], axis=-1)

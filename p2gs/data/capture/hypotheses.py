@@ -15,7 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from p2gs.data.capture.model import Model, similarity
 
-RATIO = 0.9  # nearest to second-nearest distance of mean descriptors; they are more alike than single ones, hence not 0.8
+RATIO = (
+    0.9  # nearest to second-nearest distance of mean descriptors; they are more alike than single ones, hence not 0.8
+)
 MAX_COSINE_GAP = 0.25  # 1 - cosine of two descriptors of one thing
 INLIER = 0.008  # reprojection error of a vote as a share of the image's long edge: two reconstructions' points agree to about 8 mm at 1 m
 MIN_VOTES = 12  # a similarity has 7 unknowns, 3 votes fix it; chance reached 8 in rooms without common texture
@@ -58,7 +60,12 @@ class Hypothesis:
         return float(np.cbrt(np.linalg.det(self.T[:3, :3])))
 
     def to_dict(self) -> dict:
-        return {"votes": len(self.pairs), "spread": round(self.spread, 3), "outside": round(self.outside, 3), "board": self.board}
+        return {
+            "votes": len(self.pairs),
+            "spread": round(self.spread, 3),
+            "outside": round(self.outside, 3),
+            "board": self.board,
+        }
 
 
 def match_descriptors(a: np.ndarray, b: np.ndarray, chunk: int = 2000) -> np.ndarray:
@@ -92,7 +99,11 @@ class Sightings:
         starts = np.searchsorted(rows[order], np.arange(len(model.ids)))
         counts = np.bincount(rows, minlength=len(model.ids))
         middle = order[np.minimum(starts + counts // 2, len(order) - 1)]  # of an orbit's track the one in the middle
-        self.camera, self.ray, self.focal = np.zeros((len(model.ids), 3, 4)), np.zeros((len(model.ids), 2)), np.zeros(len(model.ids))
+        self.camera, self.ray, self.focal = (
+            np.zeros((len(model.ids), 3, 4)),
+            np.zeros((len(model.ids), 2)),
+            np.zeros(len(model.ids)),
+        )
         for key in np.unique(images[middle]):
             mine = images[middle] == key
             photo = model.photos[key]

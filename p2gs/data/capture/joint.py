@@ -74,12 +74,18 @@ def merged(start: Model, end: Model, T: np.ndarray, pairs: np.ndarray) -> Model:
     new_id[pairs[:, 1]] = start.ids[pairs[:, 0]]
     lenses, lens_of = dict(start.lenses), {}
     for key, lens in end.lenses.items():
-        same = [k for k, other in start.lenses.items() if (other.width, other.height, other.model) == (lens.width, lens.height, lens.model)]
+        same = [
+            k
+            for k, other in start.lenses.items()
+            if (other.width, other.height, other.model) == (lens.width, lens.height, lens.model)
+        ]
         lens_of[key] = same[0] if same else max(lenses) + 1
         lenses.setdefault(lens_of[key], lens)
     photos = dict(start.photos)
     for key, photo in end.photos.items():
-        point = np.where(photo.point >= 0, new_id[np.searchsorted(end.ids, np.maximum(photo.point, end.ids.min(initial=0)))], -1)
+        point = np.where(
+            photo.point >= 0, new_id[np.searchsorted(end.ids, np.maximum(photo.point, end.ids.min(initial=0)))], -1
+        )
         photos[key + END_OFFSET] = replace(photo, lens=lens_of[photo.lens], point=point)
     own = np.setdiff1d(np.arange(len(end.ids)), pairs[:, 1])
     xyz = start.xyz.copy()
@@ -124,7 +130,14 @@ def adjusted(model: Model, folder: Path, principal_point: bool, progress: Callab
     return read_model(folder / "model")
 
 
-def join(start: State, end: State, T: np.ndarray, folder: Path, extra=None, progress: Callable[[str], None] = lambda text: None) -> Model:
+def join(
+    start: State,
+    end: State,
+    T: np.ndarray,
+    folder: Path,
+    extra=None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Model:
     """One adjusted model of both states in the start's frame.
 
     T: [4, 4] static similarity start -> end.  extra: function that adds tracks of its own to the merged model (marker corners), or None.
@@ -144,10 +157,15 @@ def join(start: State, end: State, T: np.ndarray, folder: Path, extra=None, prog
 
 def _relative(model: Model, start: Model, end: Model) -> np.ndarray:
     """The similarity start -> end that the joint model implies, by the cameras of both."""
+
     def centres(other: Model, shift: int) -> tuple[np.ndarray, np.ndarray]:
         keys = [k for k in other.photos if k + shift in model.photos]
         reach = 0.3 * other.centre()[1]  # a second point on each axis, so that cameras in a line still fix the turn
-        own = [p for k in keys for p in (other.photos[k].position, other.photos[k].position + reach * other.photos[k].forward)]
+        own = [
+            p
+            for k in keys
+            for p in (other.photos[k].position, other.photos[k].position + reach * other.photos[k].forward)
+        ]
         return np.array(own), np.array(keys)
 
     def into_joint(other: Model, shift: int) -> np.ndarray:
@@ -172,7 +190,10 @@ def triangulated(model: Model, end: bool) -> tuple[np.ndarray, np.ndarray]:
             continue
         has = photo.point >= 0
         rows = np.searchsorted(model.ids, photo.point[has])
-        ray = np.pad(model.lenses[photo.lens].rays(photo.xy[has]), ((0, 0), (0, 1)), constant_values=1.0) @ photo.viewmat[:3, :3]
+        ray = (
+            np.pad(model.lenses[photo.lens].rays(photo.xy[has]), ((0, 0), (0, 1)), constant_values=1.0)
+            @ photo.viewmat[:3, :3]
+        )
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         away = np.linalg.norm(model.xyz[rows] - photo.position, axis=1)
         P = (np.eye(3) - ray[:, :, None] * ray[:, None, :]) / away[:, None, None] ** 2
@@ -201,5 +222,3 @@ def state_bias(model: Model) -> Bias:
         weight = 1 / (np.linalg.norm(a, axis=1) + distance) ** 2 / (1 + (off / (np.median(off) + 1e-12)) ** 2)
     turn = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
     return Bias(float(np.linalg.norm(T[:3, 3])), float(turn), int(both.sum()), share)
-
-

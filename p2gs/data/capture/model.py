@@ -77,7 +77,9 @@ class Lens:
         if front.any():
             points = np.ascontiguousarray(local[front], np.float64)[:, None]
             if self.fisheye:
-                out[front] = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), self.K, self.distortion)[0][:, 0]
+                out[front] = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), self.K, self.distortion)[0][
+                    :, 0
+                ]
             else:
                 out[front] = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.K, self.distortion)[0][:, 0]
         return out

@@ -44,14 +44,18 @@ def _plan(model: Model, box: np.ndarray, axes: tuple[int, int], title: str) -> s
     parts = []
     for i in np.random.default_rng(0).permutation(len(xyz))[:MAX_DOTS]:
         if np.abs(xyz[i]).max() < size:
-            colour = COLOURS["seen in both" if seen[i].all() else f"seen in the {'second' if seen[i, 1] else 'first'} state only"]
+            colour = COLOURS[
+                "seen in both" if seen[i].all() else f"seen in the {'second' if seen[i, 1] else 'first'} state only"
+            ]
             parts.append('<circle cx="%.1f" cy="%.1f" r="1.3" fill="%s"/>' % (*at(xyz[i]), colour))
     for p in model.photos.values():
         a, b = at(p.position), at(p.position + 0.06 * size * p.forward)
         colour = "#26c" if is_end(p.name) else "#c62"
         parts.append('<line x1="%.1f" y1="%.1f" x2="%.1f" y2="%.1f" stroke="%s" stroke-width="2"/>' % (*a, *b, colour))
     (x0, y0), (x1, y1) = at(box[0]), at(box[1])
-    parts.append(f'<rect x="{x0:.1f}" y="{y1:.1f}" width="{x1 - x0:.1f}" height="{y0 - y1:.1f}" fill="none" stroke="#090" stroke-width="2"/>')
+    parts.append(
+        f'<rect x="{x0:.1f}" y="{y1:.1f}" width="{x1 - x0:.1f}" height="{y0 - y1:.1f}" fill="none" stroke="#090" stroke-width="2"/>'
+    )
     return f'<figure><svg viewBox="0 0 600 600" width="480">{"".join(parts)}</svg><figcaption>{html.escape(title)}</figcaption></figure>'
 
 
@@ -60,7 +64,9 @@ def write_page(scene: Path, model: Model, box: np.ndarray, facts: dict) -> None:
     files = [i["file"] for i in facts["images"] if i["file"]]
     contact_sheet(scene, files, scene / "contact.jpg")
     legend = "".join(f'<li style="color:{c}">{n}</li>' for n, c in COLOURS.items())
-    left_out = "".join(f"<li>{html.escape(i['source'])}: {html.escape(i['reason'])}</li>" for i in facts["images"] if not i["file"])
+    left_out = "".join(
+        f"<li>{html.escape(i['source'])}: {html.escape(i['reason'])}</li>" for i in facts["images"] if not i["file"]
+    )
     brief = {k: v for k, v in facts.items() if k not in ("images", "gains")}
     (scene / "capture.html").write_text(
         f"""<!doctype html><meta charset="utf-8"><title>capture</title><style>body{{font:15px sans-serif;margin:2em}}

@@ -58,7 +58,9 @@ def listed(source: Path) -> list[Path]:
     if len(photos) < MIN_PHOTOS:
         videos = [p.name for p in files if p.suffix.lower() in VIDEOS]
         hint = f"; it holds the video {videos[0]}, give that file itself" if videos else ""
-        raise UserError(f"{source}: has {len(photos)} photographs, expected at least {MIN_PHOTOS} from around the object{hint}")
+        raise UserError(
+            f"{source}: has {len(photos)} photographs, expected at least {MIN_PHOTOS} from around the object{hint}"
+        )
     return photos
 
 
@@ -85,7 +87,9 @@ def copy_photos(source: Path, state: str, folder: Path, size: int, limit: int) -
     paths = listed(source)
     if any(p.suffix.lower() in HEIC for p in paths) and not heic_opener():
         first = next(p for p in paths if p.suffix.lower() in HEIC)
-        raise UserError(f"{first}: HEIC needs pillow-heif (pip install 'p2gs[heic]'), or set the phone to take JPEG ('most compatible')")
+        raise UserError(
+            f"{first}: HEIC needs pillow-heif (pip install 'p2gs[heic]'), or set the phone to take JPEG ('most compatible')"
+        )
     if len(paths) > limit:
         paths = [paths[i] for i in np.linspace(0, len(paths) - 1, limit).round().astype(int)]
     return [_copied(path, state, i, folder, size) for i, path in enumerate(paths)]
@@ -102,7 +106,9 @@ def _copied(path: Path, state: str, index: int, folder: Path, size: int) -> Shot
     except (OSError, UnidentifiedImageError) as err:
         raise UserError(f"{path}: cannot be read as a photograph ({err})") from err
     if min(pixels.shape[:2]) < 200:
-        raise UserError(f"{path}: is {pixels.shape[1]}x{pixels.shape[0]} pixels, expected at least 200 on the shorter side")
+        raise UserError(
+            f"{path}: is {pixels.shape[1]}x{pixels.shape[0]} pixels, expected at least 200 on the shorter side"
+        )
     focal = None if focal is None else focal / FILM_DIAGONAL * float(np.hypot(*pixels.shape[:2]))
     return store(pixels, str(path), focal, device, state, index, folder, size)
 
@@ -151,11 +157,17 @@ def sharpness(pixels: np.ndarray) -> float:
 def drop_blurred(shots: list[Shot]) -> tuple[list[Shot], dict[str, str]]:
     """(sharp photographs, {name: why it is left out}). Raises UserError where too few are left."""
     median = float(np.median([s.sharpness for s in shots]))
-    reasons = {s.name: f"blurred: sharpness {s.sharpness:.0f}, the median is {median:.0f}" for s in shots if s.sharpness < BLURRED * median}
+    reasons = {
+        s.name: f"blurred: sharpness {s.sharpness:.0f}, the median is {median:.0f}"
+        for s in shots
+        if s.sharpness < BLURRED * median
+    }
     kept = [s for s in shots if s.name not in reasons]
     if len(kept) < MIN_PHOTOS:
         where = Path(shots[0].source).parent
-        raise UserError(f"{where}: only {len(kept)} of {len(shots)} photographs are sharp; hold still for each, with more light")
+        raise UserError(
+            f"{where}: only {len(kept)} of {len(shots)} photographs are sharp; hold still for each, with more light"
+        )
     return kept, reasons
 
 

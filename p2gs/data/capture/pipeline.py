@@ -110,7 +110,9 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     page.write_page(out, model, box, facts)
     bias = facts["bias"]
     if bias["share_of_distance"] is not None and bias["share_of_distance"] > WARN_BIAS:
-        progress(f"warning: the states are {100 * bias['share_of_distance']:.2f} % of the distance apart on the static scene (capture.json)")
+        progress(
+            f"warning: the states are {100 * bias['share_of_distance']:.2f} % of the distance apart on the static scene (capture.json)"
+        )
     return out
 
 
@@ -124,7 +126,11 @@ def _photos(sources: dict[str, Path], work: Path, cache: Cache, options: Options
         def make(state=state, source=source) -> dict:
             progress(f"{state}: copying photographs")
             shutil.rmtree(work / "photos" / state, ignore_errors=True)
-            return {"shots": [s.to_dict() for s in copy_photos(source, state, work / "photos", options.size, options.max_views)]}
+            return {
+                "shots": [
+                    s.to_dict() for s in copy_photos(source, state, work / "photos", options.size, options.max_views)
+                ]
+            }
 
         depends = [_stamp(source), options.size, options.max_views]
         mine = [Shot(**s) for s in cache.get(f"photos_{state}", depends, make, progress)["shots"]]
@@ -179,7 +185,10 @@ def _reconstructed(state: str, shots: list[Shot], work: Path, cache: Cache, care
 
 def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progress: Progress):
     """(joint model, {corner: point id}, facts) by structure from motion."""
-    states = [_reconstructed(s, [x for x in shots if x.name.startswith(s)], work, cache, options.careful, progress) for s in STATES]
+    states = [
+        _reconstructed(s, [x for x in shots if x.name.startswith(s)], work, cache, options.careful, progress)
+        for s in STATES
+    ]
     progress("looking for the marker board")
     seen = marker_board.find_board([s.name for s in shots], work / "photos")
     found = hypotheses_of(*states, seen)
@@ -226,7 +235,9 @@ def _oriented(model: Model, corners: dict[int, int]) -> tuple[Model, dict]:
         metres, source = 1 / float(np.cbrt(np.linalg.det(T[:3, :3]))), "board"
         normal = T[:3, 2] * metres
         normal = normal * np.sign(normal @ frame.mean_up(model))
-        if normal @ floor.normal < np.cos(np.radians(5)) or floor.source == "cameras":  # two measures of one floor: the larger plane is better
+        if (
+            normal @ floor.normal < np.cos(np.radians(5)) or floor.source == "cameras"
+        ):  # two measures of one floor: the larger plane is better
             floor = frame.Floor(normal, float(normal @ T[:3, 3]), "board")
         about["board_rms_mm"] = round(1000 * rms, 2)
     return model.moved(frame.to_world(floor, model, metres)), about | {"scale": {"source": source}, "up": floor.source}
@@ -259,7 +270,9 @@ def _object_box(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
         pinhole = write.pinhole_of(lens)
         alpha = cv2.remap(masks[photo.name], *pinhole.maps, cv2.INTER_NEAREST)
         camera = Camera(torch.tensor(photo.viewmat).float(), torch.tensor(pinhole.K).float(), lens.width, lens.height)
-        views.append(View(photo.name, int(is_end(photo.name)), "train", camera, torch.empty(0), torch.from_numpy(alpha)))
+        views.append(
+            View(photo.name, int(is_end(photo.name)), "train", camera, torch.empty(0), torch.from_numpy(alpha))
+        )
     return object_box(views).double().numpy()
 
 

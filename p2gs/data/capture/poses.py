@@ -43,7 +43,9 @@ def _frame_lens(meta: dict, frame: dict, where: str) -> Lens:
     both = {**{k: meta[k] for k in KEYS if k in meta}, **frame}
     missing = [k for k in ("fl_x", "cx", "cy", "w", "h") if k not in both]
     if missing:
-        raise UserError(f"{where}: has no {', '.join(missing)}; expected fl_x, fl_y, cx, cy, w, h of the file or of each frame")
+        raise UserError(
+            f"{where}: has no {', '.join(missing)}; expected fl_x, fl_y, cx, cy, w, h of the file or of each frame"
+        )
     kind = meta.get("camera_model", "OPENCV")
     focal = [float(both["fl_x"]), float(both.get("fl_y", both["fl_x"])), float(both["cx"]), float(both["cy"])]
     k = {name: float(both.get(name, 0.0)) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
@@ -54,7 +56,9 @@ def _frame_lens(meta: dict, frame: dict, where: str) -> Lens:
         return Lens(kind, *size, np.array([*focal, k["k1"], k["k2"], k["k3"], k["k4"]]))
     if kind in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         if k["k3"] or k["k4"]:
-            return Lens("FULL_OPENCV", *size, np.array([*focal, k["k1"], k["k2"], k["p1"], k["p2"], k["k3"], k["k4"], 0, 0]))
+            return Lens(
+                "FULL_OPENCV", *size, np.array([*focal, k["k1"], k["k2"], k["p1"], k["p2"], k["k3"], k["k4"], 0, 0])
+            )
         return Lens("OPENCV", *size, np.array([*focal, k["k1"], k["k2"], k["p1"], k["p2"]]))
     raise UserError(f"{where}: camera_model {kind} is not known; known: OPENCV, PINHOLE, OPENCV_FISHEYE")
 
@@ -120,7 +124,9 @@ def state_of(name: str, start: Path, end: Path, in_start: bool, in_end: bool) ->
     for state, folder in (("start", start), ("end", end)):
         if state in folders or folder.name in folders:
             return state
-    raise UserError(f"poses: {name} may belong to either state; put the photographs into folders start/ and end/ before solving the poses")
+    raise UserError(
+        f"poses: {name} may belong to either state; put the photographs into folders start/ and end/ before solving the poses"
+    )
 
 
 def onto_copies(model: Model, shots: list[Shot], start: Path, end: Path) -> Model:
@@ -151,7 +157,9 @@ def onto_copies(model: Model, shots: list[Shot], start: Path, end: Path) -> Mode
     for state in ("start", "end"):
         if sum(p.name.startswith(state) for p in photos.values()) < 2:
             folder = start if state == "start" else end
-            raise UserError(f"{folder}: the poses name none or only one of its photographs; expected the same file names")
+            raise UserError(
+                f"{folder}: the poses name none or only one of its photographs; expected the same file names"
+            )
     used = np.unique(np.concatenate([p.point[p.point >= 0] for p in photos.values()]))
     keep = np.isin(model.ids, used)
     return Model(lenses, photos, model.ids[keep], model.xyz[keep], model.rgb[keep])

@@ -26,7 +26,9 @@ class Effort:
     max_size: int = 1200
     first_octave: int = 0
     features: int = 3000
-    peak: float = 0.004  # contrast below which a feature is noise; COLMAP's own is 0.0067, fewer features on plain walls
+    peak: float = (
+        0.004  # contrast below which a feature is noise; COLMAP's own is 0.0067, fewer features on plain walls
+    )
     init_inliers: int = 60
     init_angle: float = 8.0  # degrees
     pose_inliers: int = 20
@@ -159,7 +161,9 @@ def _map(pycolmap, database: Path, job: dict, effort: Effort, total: int):
 
     folder = Path(job["out"]) / "models"
     folder.mkdir(exist_ok=True)
-    found = pycolmap.incremental_mapping(str(database), job["images"], str(folder), options=options, next_image_callback=one_more)
+    found = pycolmap.incremental_mapping(
+        str(database), job["images"], str(folder), options=options, next_image_callback=one_more
+    )
     if not found:
         return None, 0
     return max(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D())), len(found)

@@ -74,7 +74,9 @@ def check_joint_support(model: Model) -> dict:
         return {"points": 0}
     rows = np.flatnonzero(states_of(model).all(1))
     if len(rows) < MIN_VOTES:
-        raise UserError(f"the poses' two states share {len(rows)} points, expected at least {MIN_VOTES}: they need not lie in one frame; {ADVICE}")
+        raise UserError(
+            f"the poses' two states share {len(rows)} points, expected at least {MIN_VOTES}: they need not lie in one frame; {ADVICE}"
+        )
     spread, outside = extent(model, rows)
     support = Hypothesis(np.eye(4), np.stack([rows, rows], 1), spread, outside)
     if not support.wide:

@@ -39,7 +39,9 @@ def pinhole_of(lens: Lens) -> Pinhole:
     return Pinhole(np.linalg.inv(centre) @ K, maps)
 
 
-def write_scene(model: Model, photos: Path, masks: dict[str, np.ndarray], gains: dict[int, np.ndarray], out: Path) -> dict[str, str]:
+def write_scene(
+    model: Model, photos: Path, masks: dict[str, np.ndarray], gains: dict[int, np.ndarray], out: Path
+) -> dict[str, str]:
     """Write everything; returns photograph's name -> file below ``out``.
 
     model: in scene coordinates, photographs named as the copies in ``photos``.  masks: [H, W] uint8 by name; a photograph without one is left out.  gains: see ``gains``.
@@ -55,7 +57,12 @@ def write_scene(model: Model, photos: Path, masks: dict[str, np.ndarray], gains:
         pinhole, lens = pinholes[photo.lens], model.lenses[photo.lens]
         image = cv2.imread(str(photos / photo.name))[..., ::-1]
         image = corrected(image, gains.get(key, np.zeros(3)))
-        rgba = np.dstack([cv2.remap(image, *pinhole.maps, cv2.INTER_LINEAR), cv2.remap(masks[photo.name], *pinhole.maps, cv2.INTER_LINEAR)])
+        rgba = np.dstack(
+            [
+                cv2.remap(image, *pinhole.maps, cv2.INTER_LINEAR),
+                cv2.remap(masks[photo.name], *pinhole.maps, cv2.INTER_LINEAR),
+            ]
+        )
         path = f"{state}/train/rgba/{len(frames[state]):04d}.png"
         (out / path).parent.mkdir(parents=True, exist_ok=True)
         if not cv2.imwrite(str(out / path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, 3]):
