@@ -114,7 +114,7 @@ def parser(prog: str = "p2gs") -> Parser:
     capture.add_argument("--mask_means", "--mask-means", **means)
     capture.add_argument("--poses", metavar="PATH", help="a COLMAP model or transforms.json of both states: no structure from motion")
     capture.add_argument("--static", type=int, metavar="N", help="which hypothesis of capture.json is the room (default: the widest)")
-    capture.add_argument("--height", type=float, metavar="M", help="height of the object above the floor in metres, where there is no board")
+    capture.add_argument("--height", type=float, metavar="M", help="height of the object in metres, where there is no board")
     capture.add_argument("--max_views", "--max-views", type=int, default=60, metavar="N", help="photographs a state (default 60)")
     capture.add_argument("--size", type=int, default=1600, metavar="PX", help="longer side of the scene's images (default 1600)")
     capture.add_argument("--careful", action="store_true", help="more features, every pair of photographs: several times slower")

@@ -12,8 +12,10 @@ from pathlib import Path
 from p2gs.types import UserError
 
 NO_PYCOLMAP = 3  # exit code of the child
-HOW_TO_INSTALL = "structure from motion needs pycolmap: pip install 'p2gs[capture]' "
+HOW_TO_INSTALL = (
+    "structure from motion needs pycolmap: pip install 'p2gs[capture]' "
     "(there is no wheel for Linux on ARM: bring poses with --poses)"
+)
 
 
 def threads() -> int:

@@ -179,7 +179,8 @@ def _reconstructed(state: str, shots: list[Shot], work: Path, cache: Cache, care
             return State(model, d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-6))
     raise UserError(
         f"{Path(shots[0].source).parent}: only {result['registered']} of {total} photographs could be placed; "
-        "take them closer together (a step to the side each), with the room in view, and lay newspapers or a patterned rug around the object"
+        "take them closer together (a step to the side each), with the room in view, "
+        "and lay newspapers or a patterned rug around the object"
     )
 
 

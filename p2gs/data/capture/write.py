@@ -44,7 +44,8 @@ def write_scene(
 ) -> dict[str, str]:
     """Write everything; returns photograph's name -> file below ``out``.
 
-    model: in scene coordinates, photographs named as the copies in ``photos``.  masks: [H, W] uint8 by name; a photograph without one is left out.  gains: see ``gains``.
+    model: in scene coordinates, photographs named as the copies in ``photos``.  masks: [H, W] uint8 by name; a photograph
+    without one is left out.  gains: see ``gains``.
     """
     import cv2
 
