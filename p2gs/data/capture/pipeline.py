@@ -258,7 +258,7 @@ def _scaled(model: Model, masks: dict[str, np.ndarray], options: Options, about:
 
 
 def _object_box(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
-    """[2, 3] corners of the object by its masks, in the model's coordinates."""
+    """[2, 3] corners of the object by its masks, in the model's coordinates (floor at z = 0)."""
     import cv2
     import torch
 
@@ -274,7 +274,9 @@ def _object_box(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
         views.append(
             View(photo.name, int(is_end(photo.name)), "train", camera, torch.empty(0), torch.from_numpy(alpha))
         )
-    return object_box(views).double().numpy()
+    box = object_box(views).double().numpy()
+    box[0, 2] = max(box[0, 2], 0.0)  # the hull of photographs from above goes on below the floor
+    return box
 
 
 def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, box: np.ndarray) -> dict:
