@@ -64,6 +64,7 @@ def parser(prog: str = "p2gs") -> Parser:
     test = add("test", "score a run against the scene's ground truth and write metrics.json")
     test.add_argument("run", metavar="RUN", help="result folder of a fit")
     test.add_argument("--root", metavar="DIR", help="the scene's folder, where it has moved since the fit")
+    test.add_argument("--truth", metavar="DIR", help="a capture's true cameras, joints and meshes: score in metres")
 
     predict = add("predict", "render a run's twin at any state between start (0) and end (1)")
     predict.add_argument("run", metavar="RUN", help="result folder of a fit")
@@ -106,6 +107,23 @@ def parser(prog: str = "p2gs") -> Parser:
     synth.add_argument("--test_views", type=int, metavar="N", help="test views a state")
     synth.add_argument("--format", choices=("artgs", "dta", "paris"), default="artgs", help="layout (default artgs)")
     synth.add_argument("--no_depth", action="store_true", help="write no depth maps")
+
+    about = "Turn photographs (or videos) of two joint states into a scene."
+    capture = actions.add_parser("capture", help="photographs of two states to a scene", description=about)
+    capture.add_argument("start", metavar="SHUT", help="folder of photographs of the first state, or a video")
+    capture.add_argument("end", metavar="OPEN", help="the same of the second state; nothing but the parts may have moved")
+    capture.add_argument("--out", required=True, metavar="SCENE", help="folder to write")
+    capture.add_argument("--masks", metavar="DIR", help="masks of the object, white = object (default: alpha, else from 3D)")
+    means = {"choices": ("object", "ignore"), "default": "object", "help": "ignore: nerfstudio's masks"}
+    capture.add_argument("--mask_means", "--mask-means", **means)
+    capture.add_argument("--poses", metavar="PATH", help="a COLMAP model or transforms.json of both states: no structure from motion")
+    capture.add_argument("--static", type=int, metavar="N", help="which hypothesis of capture.json is the room (default: the widest)")
+    capture.add_argument("--height", type=float, metavar="M", help="height of the object in metres, where there is no board")
+    capture.add_argument("--max_views", "--max-views", type=int, default=60, metavar="N", help="photographs a state (default 60)")
+    capture.add_argument("--size", type=int, default=1600, metavar="PX", help="longer side of the scene's images (default 1600)")
+    capture.add_argument("--careful", action="store_true", help="more features, every pair of photographs: several times slower")
+    board = actions.add_parser("board", help="a marker sheet to print, for scale and up", description="A marker sheet to print.")
+    board.add_argument("--out", default="board.pdf", metavar="FILE", help="PDF or PNG (default board.pdf)")
 
     about = "Check a downloaded benchmark against the object lists."
     ready = actions.add_parser("prepare", help="check a downloaded benchmark", description=about)

@@ -31,7 +31,7 @@ ALLOWED = {
     ("p2gs.export.evaluate", "p2gs.config"): "the scene of a run is read from its config.yaml",
 }
 OPTIONAL = ["gsplat", "viser", "imageio_ffmpeg", "pxr", "mujoco", "yourdfpy", "embreex", "hypothesis", "beartype",
-            "matplotlib", "submitit", "ray"]
+            "matplotlib", "submitit", "ray", "pycolmap", "pillow_heif"]
 
 
 def modules():

@@ -1,4 +1,6 @@
-"""The commands on scene folders: ``p2gs data check``, ``synth`` and ``prepare``. Each takes the parsed arguments, returns the exit code."""
+"""The commands on scene folders: ``p2gs data check``, ``synth``, ``prepare``, ``capture`` and ``board``.
+
+Each takes the parsed arguments, returns the exit code."""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from p2gs.types import UserError
 
 
 def data(args: argparse.Namespace) -> int:
-    return {"check": check, "synth": synth, "prepare": prepare}[args.action](args)
+    return {"check": check, "synth": synth, "prepare": prepare, "capture": capture, "board": board}[args.action](args)
 
 
 def prepare(args: argparse.Namespace) -> int:
@@ -49,4 +51,36 @@ def synth(args: argparse.Namespace) -> int:
     given = {k: v for k, v in given.items() if v is not None}
     folder = synthesize(args.out, seed=args.seed, kind=args.kind, format=args.format, depth=not args.no_depth, **given)
     print(f"{folder}: written; train on it with: p2gs fit -c preset/cpu.yaml -c data/{args.format}.yaml --data.root {folder}")
+    return 0
+
+
+def board(args: argparse.Namespace) -> int:
+    """The marker sheet."""
+    from pathlib import Path
+
+    from p2gs.data.capture.board import write_board
+
+    write_board(Path(args.out))
+    print(f"{args.out}: print at 100 %, check the ruler, lay it flat on the floor beside the object for both states")
+    return 0
+
+
+def capture(args: argparse.Namespace) -> int:
+    """Photographs to a scene; prints each stage and how to train on the result."""
+    from pathlib import Path
+
+    from p2gs.data.capture.pipeline import Options, capture_scene
+
+    for name in ("max_views", "size"):
+        if getattr(args, name) < 8:
+            raise UserError(f"data capture: {name} is {getattr(args, name)}, expected at least 8")
+    if args.height is not None and not args.height > 0:
+        raise UserError(f"data capture: --height is {args.height:g}, expected metres above 0")
+    options = Options(
+        masks=None if args.masks is None else Path(args.masks), ignore=args.mask_means == "ignore",
+        poses=None if args.poses is None else Path(args.poses), static=args.static, height=args.height,
+        max_views=args.max_views, size=args.size, careful=args.careful,
+    )  # fmt: skip
+    folder = capture_scene(Path(args.start), Path(args.end), Path(args.out), options, progress=lambda text: print(text, flush=True))
+    print(f"{folder}: written; look at capture.html there, then: p2gs fit -c preset/cpu.yaml -c data/artgs.yaml --data.root {folder}")
     return 0

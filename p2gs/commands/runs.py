@@ -31,6 +31,13 @@ def test(args: argparse.Namespace) -> int:
     from p2gs.export.score_table import score_tables
 
     run = finished_run(args.run)
+    if args.truth is not None:
+        from p2gs.export.evaluate_capture import capture_lines, evaluate_capture
+
+        for line in capture_lines(evaluate_capture(run, args.truth, args.root)):
+            print(line)
+        print(f"written: {run / 'capture_metrics.json'}")
+        return 0
     rich_print(score_tables(evaluate_run(run, args.root)))
     write_hparams(run)
     if (run / "report.html").is_file():

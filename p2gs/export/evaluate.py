@@ -96,6 +96,16 @@ def open_scene(run_dir: Path, root: Optional[Path | str] = None):
     return scene, truth
 
 
+def scene_folder(run_dir: Path) -> Path:
+    """The folder of a run's scene, by the run's config.yaml. Raises UserError where that is missing."""
+    from p2gs.config import load_config
+
+    path = Path(run_dir) / "config.yaml"
+    if not path.is_file():
+        raise UserError(f"{path} is missing, so the scene of this run is not known")
+    return Path(load_config([str(path)], []).data.root)
+
+
 def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]) -> dict:
     """Photometric and depth errors of both states and their mean. ``obj`` and ``scene`` in one coordinate system."""
     diagonal = float((bounds(obj)[1] - bounds(obj)[0]).norm())

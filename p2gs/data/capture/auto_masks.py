@@ -1,0 +1,157 @@
+"""Masks from 3D: the object's Gaussians of a coarse splat drawn into every photograph, their edge sharpened in the photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from p2gs.data.capture.coarse import REGION, Picture, Region, fit, initial, object_rows, region_of
+from p2gs.data.capture.gains import corrected
+from p2gs.data.capture.joint import is_end, states_of
+from p2gs.data.capture.model import Model
+from p2gs.data.capture.write import pinhole_of
+from p2gs.types import Camera, UserError
+
+COARSE = 200  # px, long edge of the splat's pictures
+SHARP = 480  # px, long edge that edges are sharpened at
+BAND = 0.012  # of the long edge, to either side of the drawn edge: two pixels of the splat's pictures
+IN_HULL = 0.93  # share of the photographs that must show a point within the outline; a ragged coarse outline misses some at its edge
+PORE = 0.03  # of the mask: smaller holes are the coarse splat's, where a plain side gave it nothing to hold on to
+CHANGED = 0.15  # share of the mask that sharpening may change before it is not believed
+
+
+def pictures_of(model: Model, photos: Path, gains: dict[int, np.ndarray], keys: list[int], size: int) -> list[Picture]:
+    """The photographs of ``keys`` undistorted, their gains taken out, at a long edge of ``size``."""
+    import cv2
+
+    out = []
+    for key in keys:
+        photo = model.photos[key]
+        lens = model.lenses[photo.lens]
+        pinhole = pinhole_of(lens)
+        image = corrected(cv2.imread(str(photos / photo.name))[..., ::-1], gains.get(key, np.zeros(3)))
+        image = cv2.remap(image, *pinhole.maps, cv2.INTER_LINEAR)
+        factor = min(1.0, size / max(lens.width, lens.height))
+        width, height = round(lens.width * factor), round(lens.height * factor)
+        camera = Camera(torch.tensor(photo.viewmat).float(), torch.tensor(pinhole.K).float(), lens.width, lens.height)
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        out.append(Picture(camera.scaled(width, height), torch.from_numpy(image).float() / 255))
+    return out
+
+
+def sharpened(image: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """[h, w] bool: the object by GrabCut in a band around the edge of ``share`` [h, w] float (what the splat says). image: uint8 RGB."""
+    import cv2
+
+    drawn = (share > 0.5).astype(np.uint8)
+    reach = max(round(BAND * max(drawn.shape)), 2)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    inner, outer = cv2.erode(drawn, kernel), cv2.dilate(drawn, kernel)
+    if not inner.any() or outer.all():
+        return drawn > 0
+    labels = np.where(drawn > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels[inner > 0], labels[outer == 0] = cv2.GC_FGD, cv2.GC_BGD
+    cv2.setRNGSeed(0)
+    cv2.grabCut(
+        np.ascontiguousarray(image[..., ::-1]),
+        labels,
+        None,
+        np.zeros((1, 65)),
+        np.zeros((1, 65)),
+        3,
+        cv2.GC_INIT_WITH_MASK,
+    )
+    cut = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+    return drawn > 0 if (cut != (drawn > 0)).sum() > CHANGED * drawn.sum() else cut
+
+
+def without_pores(mask: np.ndarray) -> np.ndarray:
+    """The mask [h, w] bool with enclosed holes below ``PORE`` of its area filled."""
+    from scipy.ndimage import binary_fill_holes, label
+
+    holes, count = label(binary_fill_holes(mask) & ~mask)
+    sizes = np.bincount(holes.ravel(), minlength=count + 1)
+    small = sizes < PORE * mask.sum()
+    small[0] = False
+    return mask | small[holes]
+
+
+def enclosed(splat, rows: torch.Tensor, pictures: list[Picture], region: Region) -> torch.Tensor:
+    """[N] bool: Gaussians that no photograph shows beside the object, though they are none of its body's.
+
+    A dark inside without texture is explained by floor and wall behind it, which nobody sees from elsewhere: what lies in the hull of the
+    body's outlines is the object's (Laurentini 1994, doi:10.1109/34.273735).
+    """
+    from scipy.ndimage import binary_fill_holes
+
+    means = splat.params["means"].detach()
+    near = (means - torch.tensor(region.centre).float()).norm(dim=1) < 1.1 * REGION * region.distance
+    seen, inside = torch.zeros(len(means)), torch.zeros(len(means))
+    for picture in pictures:
+        camera = picture.camera
+        with torch.no_grad():
+            share = splat.render(camera, features=rows[:, None].float()).features[..., 0].numpy()
+        outline = torch.from_numpy(binary_fill_holes(share > 0.5))
+        local = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        x = (local[:, 0] / local[:, 2] * camera.K[0, 0] + camera.K[0, 2]).floor().long()
+        y = (local[:, 1] / local[:, 2] * camera.K[1, 1] + camera.K[1, 2]).floor().long()
+        valid = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        hit = outline[y.clamp(0, camera.height - 1), x.clamp(0, camera.width - 1)]
+        seen += valid
+        inside += valid & hit
+    return near & (seen >= 3) & (inside >= IN_HULL * seen)
+
+
+def state_masks(model: Model, photos: Path, gains: dict, region: Region, end: bool) -> dict[str, np.ndarray]:
+    """Masks [H, W] uint8 in the copies' (distorted) pixels of one state's photographs, by name."""
+
+    keys = [k for k, p in model.photos.items() if is_end(p.name) == end]
+    mine = states_of(model)[:, int(end)]
+    splat = initial(region, model.xyz[mine], model.rgb[mine])
+    fit(splat, pictures_of(model, photos, gains, keys, COARSE), region.distance)
+    rows = object_rows(splat, region)
+    if rows.sum() < 50:
+        raise UserError(
+            f"the object could not be told from the room in state '{'end' if end else 'start'}'; give --masks DIR"
+        )
+    rows |= enclosed(splat, rows, pictures_of(model, photos, gains, keys, COARSE), region)
+    out = {}
+    for key, sharp in zip(keys, pictures_of(model, photos, gains, keys, SHARP), strict=True):
+        with torch.no_grad():
+            share = splat.render(sharp.camera, features=rows[:, None].float()).features[..., 0].numpy()
+        mask = without_pores(sharpened((255 * sharp.image.numpy()).astype(np.uint8), share))
+        photo = model.photos[key]
+        out[photo.name] = distorted(mask, model.lenses[photo.lens])
+        if not out[photo.name].any():
+            del out[photo.name]
+    return out
+
+
+def distorted(mask: np.ndarray, lens) -> np.ndarray:
+    """An undistorted mask [h, w] bool of any size brought into the lens's own picture, [H, W] uint8."""
+    import cv2
+
+    K = pinhole_of(lens).K
+    x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    rays = lens.rays(np.stack([x.ravel(), y.ravel()], 1)).reshape(lens.height, lens.width, 2)
+    factor = mask.shape[1] / lens.width
+    u, v = (rays[..., 0] * K[0, 0] + K[0, 2]) * factor - 0.5, (rays[..., 1] * K[1, 1] + K[1, 2]) * factor - 0.5
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.0)
+    return np.where(cv2.remap(soft, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR) > 0.5, 255, 0).astype(
+        np.uint8
+    )
+
+
+def auto_masks(
+    model: Model, photos: Path, gains: dict, progress: Callable[[str], None] = lambda text: None
+) -> dict[str, np.ndarray]:
+    """Masks of both states by photograph's name. model: z up, floor at 0."""
+    centre, distance = model.centre()
+    centre = np.array([*centre[:2], max(centre[2], 0.1 * distance)])
+    cameras = np.array([p.position for p in model.photos.values()])
+    region = region_of(model.xyz, cameras, centre, distance)
+    progress(f"masks: a coarse fit of each state ({len(region.planes) - 1} walls)")
+    return state_masks(model, photos, gains, region, False) | state_masks(model, photos, gains, region, True)

@@ -1,0 +1,197 @@
+"""The printed marker board: a PDF to print, its corners in photographs, what they say about scale and up.
+
+4 x 3 ArUco markers (dictionary 4X4_50, ids 0 to 11) of 40 mm, 10 mm apart, on A4 across. The board lies flat on the floor and stays
+there while the parts are moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from p2gs.data.capture.model import Model, similarity
+from p2gs.types import UserError
+
+COLUMNS, ROWS, MARKER, GAP = 4, 3, 0.040, 0.010  # metres
+DPI = 300
+MIN_CORNERS = 8  # two markers: one alone fixes the scale to a per cent at best
+FITS = 0.05  # rms of the corners over the board's diagonal: more and the sheet was not flat, or is another board
+SMALL = 2400  # px: smaller photographs are enlarged before markers are sought, which are a dozen pixels wide from across a room
+MIN_SIGHTINGS = 4  # markers over all photographs: textures that look like one do so once
+
+
+def template() -> dict[int, np.ndarray]:
+    """Marker id -> [4, 3] corners in metres, in the order in which OpenCV gives them; z = 0, z up out of the sheet."""
+    out = {}
+    for row in range(ROWS):
+        for column in range(COLUMNS):
+            x, y = column * (MARKER + GAP), -row * (MARKER + GAP)
+            corners = [(x, y, 0), (x + MARKER, y, 0), (x + MARKER, y - MARKER, 0), (x, y - MARKER, 0)]
+            out[row * COLUMNS + column] = np.array(corners, float)
+    return out
+
+
+def _dictionary():
+    import cv2
+
+    return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+
+
+def write_board(path: Path) -> None:
+    """The sheet as a PDF (or PNG, by the suffix) of A4 across at 300 dpi."""
+    import cv2
+    from PIL import Image
+
+    def px(metres: float) -> int:
+        return round(metres / 0.0254 * DPI)
+
+    width, height = px(0.297), px(0.210)
+    page = np.full((height, width), 255, np.uint8)
+    board_w, board_h = COLUMNS * MARKER + (COLUMNS - 1) * GAP, ROWS * MARKER + (ROWS - 1) * GAP
+    left, top = (0.297 - board_w) / 2, (0.210 - board_h) / 2 - 0.010
+    for key, corners in template().items():
+        x, y = px(left + corners[0, 0]), px(top - corners[0, 1])
+        side = px(left + corners[1, 0]) - x
+        page[y : y + side, x : x + side] = cv2.aruco.generateImageMarker(_dictionary(), key, side)
+    y = px(0.185)
+    cv2.line(page, (px(left), y), (px(left + 0.100), y), 0, 4)
+    for k in range(11):
+        x = px(left + 0.010 * k)
+        cv2.line(page, (x, y), (x, y - px(0.004 if k % 5 else 0.006)), 0, 4)
+    text = "p2gs: print at 100 %. This ruler is 100 mm long. Lay flat on the floor beside the object; leave it there for both states."
+    cv2.putText(page, text, (px(left), y + px(0.008)), cv2.FONT_HERSHEY_SIMPLEX, 1.0, 0, 2, cv2.LINE_AA)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(page).save(path, resolution=DPI)
+    except (OSError, ValueError) as err:
+        raise UserError(
+            f"{path}: the board cannot be written ({err}); expected a name that ends in .pdf or .png"
+        ) from err
+
+
+def find_markers(path: Path, mirrored: bool = False) -> dict[int, np.ndarray]:
+    """Marker id -> [4, 2] corners in pixels (centres at +0.5) of the board's markers in a photograph.
+
+    mirrored: of a sheet printed (or rendered) mirror-wise; a plane turned over has the same corners, so nothing else changes.
+    """
+    import cv2
+
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    factor = max(1, round(SMALL / max(grey.shape)))
+    if factor > 1:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    grey = np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey
+    options = cv2.aruco.DetectorParameters()
+    options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    options.minMarkerPerimeterRate = 0.012  # of the long edge: a marker 3 thousandths wide is what can be read at all
+    options.perspectiveRemovePixelPerCell = 8
+    corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(), options).detectMarkers(grey)
+    known, out = template(), {}
+    for key, c in zip([] if ids is None else np.ravel(ids), corners, strict=True):
+        c = c.reshape(4, 2) + 0.5
+        c = np.stack([grey.shape[1] - c[:, 0], c[:, 1]], 1) if mirrored else c
+        if int(key) in known:
+            out[int(key)] = c / factor
+    return out
+
+
+def find_board(names: list[str], folder: Path) -> dict[str, dict[int, np.ndarray]]:
+    """Photograph's name -> its markers, of the photographs that show any; read as they are or mirror-wise, whichever finds more."""
+    best: dict[str, dict[int, np.ndarray]] = {}
+    for mirrored in (False, True):
+        seen = {name: markers for name in names if (markers := find_markers(folder / name, mirrored))}
+        if sum(map(len, seen.values())) > sum(map(len, best.values())):
+            best = seen
+    return best if sum(map(len, best.values())) >= MIN_SIGHTINGS else {}
+
+
+def corner_id(marker: int, corner: int) -> int:
+    return 4 * marker + corner
+
+
+def with_corners(model: Model, seen: dict[str, dict[int, np.ndarray]]) -> tuple[Model, dict[int, int]]:
+    """The model with a point for each marker corner that two photographs show, and {corner: id of its point}.
+
+    seen: photograph's name -> marker id -> [4, 2] corners.
+    """
+    rays: dict[int, list] = {}
+    for key, photo in model.photos.items():
+        for marker, corners in seen.get(photo.name, {}).items():
+            directions = (
+                np.pad(model.lenses[photo.lens].rays(corners), ((0, 0), (0, 1)), constant_values=1.0)
+                @ photo.viewmat[:3, :3]
+            )
+            for c in range(4):
+                rays.setdefault(corner_id(marker, c), []).append((key, photo.position, directions[c], corners[c]))
+    next_id, ids, xyz, points, added = int(model.ids.max(initial=0)) + 1, [], [], {}, {}
+    for corner, mine in sorted(rays.items()):
+        point = _meet(mine)
+        if len(mine) < 2 or point is None:
+            continue
+        points[corner] = next_id
+        ids.append(next_id), xyz.append(point)
+        for key, _, _, pixel in mine:
+            added.setdefault(key, []).append((pixel, next_id))
+        next_id += 1
+    if not ids:
+        return model, {}
+    photos = dict(model.photos)
+    for key, mine in added.items():
+        photo = photos[key]
+        xy, point = np.array([p for p, _ in mine]), np.array([i for _, i in mine])
+        photos[key] = replace(photo, xy=np.vstack([photo.xy, xy]), point=np.concatenate([photo.point, point]))
+    rgb = np.vstack([model.rgb, np.zeros((len(ids), 3), np.uint8)])
+    return Model(model.lenses, photos, np.concatenate([model.ids, ids]), np.vstack([model.xyz, xyz]), rgb), points
+
+
+def _meet(rays: list) -> np.ndarray | None:
+    """The point nearest to rays [(_, origin, direction, _)], robust to one that is off; None where they do not fix one."""
+    weight = np.ones(len(rays))
+    origins, directions = np.array([r[1] for r in rays]), np.array([r[2] for r in rays])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    P = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    for _ in range(5):
+        A, b = (weight[:, None, None] * P).sum(0), (weight[:, None] * np.einsum("nij,nj->ni", P, origins)).sum(0)
+        if np.linalg.cond(A) > 1e6:
+            return None
+        point = np.linalg.solve(A, b)
+        off = np.linalg.norm(np.einsum("nij,nj->ni", P, point - origins), axis=1)
+        weight = 1 / (1 + (off / (np.median(off) + 1e-12)) ** 2)
+    return point
+
+
+def board_pose(model: Model, points: dict[int, int]) -> tuple[np.ndarray, float] | None:
+    """([4, 4] similarity metres -> model, weighted rms in metres) of the board; None where too few markers are whole or they do not fit."""
+    known, there = template(), set(model.ids.tolist())
+    whole = [m for m in known if all(points.get(corner_id(m, c)) in there for c in range(4))]
+    if 4 * len(whole) < MIN_CORNERS:
+        return None
+    # centres: a corner creeps inwards where white bleeds into black, a marker's centre does not
+    flat = np.array([known[m].mean(0) for m in whole])
+    rows = np.searchsorted(model.ids, [[points[corner_id(m, c)] for c in range(4)] for m in whole])
+    found = model.xyz[rows].mean(1)
+    if len(whole) == 2:  # two centres are a line: all corners, then
+        flat, found = np.concatenate([known[m] for m in whole]), model.xyz[rows].reshape(-1, 3)
+    weight = np.ones(len(flat))
+    for _ in range(8):  # a marker read wrongly must not stretch the rest
+        T = similarity(flat, found, weight)
+        scale = np.cbrt(np.linalg.det(T[:3, :3]))
+        off = np.linalg.norm(flat @ T[:3, :3].T + T[:3, 3] - found, axis=1) / scale
+        weight = 1 / (1 + (off / (np.median(off) + 1e-6)) ** 2)
+    rms = float(np.sqrt((weight * off**2).sum() / weight.sum()))
+    diagonal = float(np.hypot(COLUMNS, ROWS) * (MARKER + GAP))
+    return (T, rms) if rms < FITS * diagonal else None
+
+
+def board_similarity(start: Model, end: Model, seen: dict[str, dict[int, np.ndarray]]) -> np.ndarray | None:
+    """[4, 4] similarity start -> end by the board's corners in each state's own model; None where it was not seen in both."""
+    found = []
+    for model in (start, end):
+        grown, points = with_corners(model, seen)
+        pose = board_pose(grown, points)
+        if pose is None:
+            return None
+        found.append(pose[0])
+    return found[1] @ np.linalg.inv(found[0])

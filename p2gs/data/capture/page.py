@@ -1,0 +1,77 @@
+"""``capture.html``: cameras and sparse cloud from above and from the side, a sheet of the masked photographs, the figures."""
+
+from __future__ import annotations
+
+import html
+import json
+from pathlib import Path
+
+import numpy as np
+
+from p2gs.data.capture.joint import is_end, states_of
+from p2gs.data.capture.model import Model
+
+COLOURS = {"seen in the first state only": "#c62", "seen in the second state only": "#26c", "seen in both": "#999"}
+MAX_DOTS = 4000
+
+
+def contact_sheet(folder: Path, files: list[str], out: Path, width: int = 240, columns: int = 8) -> None:
+    """A JPEG of RGBA images over green."""
+    import cv2
+
+    tiles = []
+    for name in files:
+        image = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
+        height = round(image.shape[0] * width / image.shape[1])
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+        alpha = image[..., 3:] / 255
+        grey = image[..., :3].mean(2, keepdims=True) * 0.35 + np.array([40, 110, 40], np.float32)
+        tiles.append(np.clip(alpha * image[..., :3] + (1 - alpha) * grey, 0, 255).astype(np.uint8))
+    height = max(t.shape[0] for t in tiles)
+    tiles = [np.pad(t, ((0, height - t.shape[0]), (0, 0), (0, 0))) for t in tiles]
+    tiles += [np.zeros((height, width, 3), np.uint8)] * (-len(tiles) % columns)
+    cv2.imwrite(str(out), np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]))
+
+
+def _plan(model: Model, box: np.ndarray, axes: tuple[int, int], title: str) -> str:
+    """An SVG of the scene along one axis."""
+    size = 3.0 * max(np.abs([p.position for p in model.photos.values()]).max(), 1e-6) / 2
+    seen, xyz = states_of(model), model.xyz
+
+    def at(p) -> tuple[float, float]:
+        return 300 + 290 * p[axes[0]] / size, 300 - 290 * p[axes[1]] / size
+
+    parts = []
+    for i in np.random.default_rng(0).permutation(len(xyz))[:MAX_DOTS]:
+        if np.abs(xyz[i]).max() < size:
+            colour = COLOURS[
+                "seen in both" if seen[i].all() else f"seen in the {'second' if seen[i, 1] else 'first'} state only"
+            ]
+            parts.append('<circle cx="%.1f" cy="%.1f" r="1.3" fill="%s"/>' % (*at(xyz[i]), colour))
+    for p in model.photos.values():
+        a, b = at(p.position), at(p.position + 0.06 * size * p.forward)
+        colour = "#26c" if is_end(p.name) else "#c62"
+        parts.append('<line x1="%.1f" y1="%.1f" x2="%.1f" y2="%.1f" stroke="%s" stroke-width="2"/>' % (*a, *b, colour))
+    (x0, y0), (x1, y1) = at(box[0]), at(box[1])
+    parts.append(
+        f'<rect x="{x0:.1f}" y="{y1:.1f}" width="{x1 - x0:.1f}" height="{y0 - y1:.1f}" fill="none" stroke="#090" stroke-width="2"/>'
+    )
+    return f'<figure><svg viewBox="0 0 600 600" width="480">{"".join(parts)}</svg><figcaption>{html.escape(title)}</figcaption></figure>'
+
+
+def write_page(scene: Path, model: Model, box: np.ndarray, facts: dict) -> None:
+    """capture.html and contact.jpg in the scene's folder. model: scene coordinates; box: [2, 3] of the object."""
+    files = [i["file"] for i in facts["images"] if i["file"]]
+    contact_sheet(scene, files, scene / "contact.jpg")
+    legend = "".join(f'<li style="color:{c}">{n}</li>' for n, c in COLOURS.items())
+    left_out = "".join(
+        f"<li>{html.escape(i['source'])}: {html.escape(i['reason'])}</li>" for i in facts["images"] if not i["file"]
+    )
+    brief = {k: v for k, v in facts.items() if k not in ("images", "gains")}
+    (scene / "capture.html").write_text(
+        f"""<!doctype html><meta charset="utf-8"><title>capture</title><style>body{{font:15px sans-serif;margin:2em}}
+figure{{display:inline-block;margin:0 1em}}</style><h1>{html.escape(scene.name)}</h1>{_plan(model, box, (0, 1), "from above")}
+{_plan(model, box, (0, 2), "from the side")}<ul>{legend}<li style="color:#090">the object's box</li></ul>
+<h2>Masks</h2><img src="contact.jpg" style="max-width:100%"><h2>Left out</h2><ul>{left_out or "<li>nothing</li>"}</ul>
+<h2>Figures</h2><pre>{html.escape(json.dumps(brief, indent=1))}</pre>"""
+    )

@@ -1,0 +1,304 @@
+"""``p2gs data capture``: the stages in their order, each kept in ``SCENE/.capture`` and skipped when what it read is unchanged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Optional
+
+import numpy as np
+
+from p2gs.data.capture import board as marker_board
+from p2gs.data.capture import frame, gains, given_masks, page, poses, write
+from p2gs.data.capture.auto_masks import auto_masks
+from p2gs.data.capture.child import run_job
+from p2gs.data.capture.colmap_io import read_model, write_model
+from p2gs.data.capture.hypotheses import Hypothesis, State
+from p2gs.data.capture.joint import is_end, join, state_bias, states_of
+from p2gs.data.capture.model import Model
+from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred, lens_groups
+from p2gs.data.capture.static import check_joint_support, choose, hypotheses_of
+from p2gs.types import UserError
+
+STATES = ("start", "end")
+FORMAT = "p2gs-capture/1"
+MIN_SHARE = 0.9  # of a state's photographs must be placed
+MIN_ARC = 60.0  # degrees around the object
+MIN_REGISTERED = 8
+WARN_BIAS = 0.005  # of the cameras' distance: a joint's axis would carry it
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Options:
+    """masks: folder of masks.  ignore: nerfstudio's meaning of them.  poses: COLMAP model or transforms.json.  static: number of the
+    hypothesis to take.  height: metres of the object.  max_views: photographs a state.  size: long edge in pixels."""
+
+    masks: Optional[Path] = None
+    ignore: bool = False
+    poses: Optional[Path] = None
+    static: Optional[int] = None
+    height: Optional[float] = None
+    max_views: int = 60
+    size: int = 1600
+    careful: bool = False
+
+
+class Cache:
+    """Results of stages by a key of all that they depend on."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def get(self, stage: str, depends: object, make: Callable[[], dict], progress: Progress) -> dict:
+        """The stage's result, from disk where ``depends`` (anything JSON knows) is the same as when it was made."""
+        key = hashlib.sha256(json.dumps(depends, sort_keys=True, default=str).encode()).hexdigest()
+        path = self.folder / f"{stage}.json"
+        if path.is_file():
+            kept = json.loads(path.read_text())
+            if kept["key"] == key:
+                progress(f"{stage}: unchanged")
+                return kept["result"]
+        path.unlink(missing_ok=True)
+        result = make()
+        path.write_text(json.dumps({"key": key, "result": result}))
+        return result
+
+
+def _stamp(source: Path) -> list:
+    files = sorted(source.iterdir()) if source.is_dir() else [source]
+    return [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in files if p.is_file()]
+
+
+def capture_scene(start: Path, end: Path, out: Path, options: Options, progress: Progress = lambda text: None) -> Path:
+    """Write the scene of two states' photographs; returns its folder. Raises UserError where the photographs cannot carry it."""
+    if out.is_file() or (out.is_dir() and any(out.iterdir()) and not (out / ".capture").is_dir()):
+        raise UserError(f"{out}: is there already and was not made by p2gs data capture; expected a new folder")
+    cache = Cache(out / ".capture")
+    work = cache.folder
+    shots, left_out = _photos({"start": start, "end": end}, work, cache, options, progress)
+    masks = _masks(shots, work / "photos", options)
+    if options.poses is not None:
+        model = poses.onto_copies(poses.read_poses(options.poses), shots, start, end)
+        facts = {"hypotheses": [], "support": check_joint_support(model), "poses": str(options.poses)}
+        seen = marker_board.find_board([s.name for s in shots], work / "photos")
+        model, corners = marker_board.with_corners(model, seen)
+    else:
+        model, corners, facts = _solved(shots, work, cache, options, progress)
+    for state in STATES:
+        _check_arc(model, state)
+    progress("exposure and white balance")
+    found = gains.photo_gains(model, work / "photos")
+    model, about = _oriented(model, corners)
+    if masks is None:
+        masks = auto_masks(model, work / "photos", found, progress)
+        _keep(masks, out / "masks")
+    model = _scaled(model, masks, options, about)
+    facts |= about | {"masks": "given" if options.masks else "alpha" if shots[0].alpha else "auto"}
+    progress("writing")
+    files = write.write_scene(model, work / "photos", masks, found, out)
+    box = _object_box(model, masks)
+    left_out |= {s.name: (s.source, "its mask is empty") for s in shots if s.name not in masks}
+    shots = [s for s in shots if s.name in masks]
+    facts |= _facts(model, shots, left_out, files, found, box)
+    (out / "capture.json").write_text(json.dumps(facts, indent=1))
+    page.write_page(out, model, box, facts)
+    bias = facts["bias"]
+    if bias["share_of_distance"] is not None and bias["share_of_distance"] > WARN_BIAS:
+        progress(
+            f"warning: the states are {100 * bias['share_of_distance']:.2f} % of the distance apart on the static scene (capture.json)"
+        )
+    return out
+
+
+def _photos(sources: dict[str, Path], work: Path, cache: Cache, options: Options, progress: Progress):
+    """(sharp photographs of both states, {name: (source, reason)} of the others)."""
+    shots, left_out = [], {}
+    for state, source in sources.items():
+        if not source.exists():
+            raise UserError(f"{source}: there is no such folder of photographs, nor such a video")
+
+        def make(state=state, source=source) -> dict:
+            progress(f"{state}: copying photographs")
+            shutil.rmtree(work / "photos" / state, ignore_errors=True)
+            return {
+                "shots": [
+                    s.to_dict() for s in copy_photos(source, state, work / "photos", options.size, options.max_views)
+                ]
+            }
+
+        depends = [_stamp(source), options.size, options.max_views]
+        mine = [Shot(**s) for s in cache.get(f"photos_{state}", depends, make, progress)["shots"]]
+        kept, reasons = drop_blurred(mine)
+        left_out |= {s.name: (s.source, reasons[s.name]) for s in mine if s.name in reasons}
+        shots += kept
+    return shots, left_out
+
+
+def _masks(shots: list[Shot], folder: Path, options: Options) -> Optional[dict[str, np.ndarray]]:
+    """Masks that are there already, or None: to be made from 3D."""
+    if options.masks is not None:
+        return given_masks.folder_masks(shots, options.masks, options.ignore)
+    return given_masks.alpha_masks(shots, folder)
+
+
+def _keep(masks: dict[str, np.ndarray], folder: Path) -> None:
+    """As PNGs that can be edited and given back with --masks."""
+    import cv2
+
+    for name, mask in masks.items():
+        path = (folder / name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), mask)
+
+
+def _reconstructed(state: str, shots: list[Shot], work: Path, cache: Cache, careful: bool, progress: Progress) -> State:
+    """A state alone: with quick settings, with careful ones where those place too few. Raises UserError where both do."""
+    from p2gs.data.capture.sfm import default_effort
+
+    total, result = len(shots), {"registered": 0, "models": 0}
+    for effort in [True] if careful else [False, True]:
+        name = f"{state}_careful" if effort else state
+        job = {"images": str((work / "photos").resolve()), "groups": lens_groups(shots), "effort": default_effort(effort),
+               "out": str((work / name).resolve())}  # fmt: skip
+        depends = [job, [(s.source, s.sharpness) for s in shots]]
+
+        def make(job=job, name=name) -> dict:
+            return run_job("reconstruct", job, work / name, lambda text: progress(f"{state}: {text}"))
+
+        result = cache.get(f"sfm_{name}", depends, make, progress)
+        if result["registered"] >= max(MIN_SHARE * total, MIN_REGISTERED):
+            progress(f"{state}: {result['registered']} of {total} photographs placed, {result['error']:.2f} px")
+            model = read_model(work / name / "model")
+            d = np.load(work / name / "descriptors.npz")["descriptors"].astype(np.float32)
+            return State(model, d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-6))
+    raise UserError(
+        f"{Path(shots[0].source).parent}: only {result['registered']} of {total} photographs could be placed; "
+        "take them closer together (a step to the side each), with the room in view, "
+        "and lay newspapers or a patterned rug around the object"
+    )
+
+
+def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progress: Progress):
+    """(joint model, {corner: point id}, facts) by structure from motion."""
+    states = [
+        _reconstructed(s, [x for x in shots if x.name.startswith(s)], work, cache, options.careful, progress)
+        for s in STATES
+    ]
+    progress("looking for the marker board")
+    seen = marker_board.find_board([s.name for s in shots], work / "photos")
+    found = hypotheses_of(*states, seen)
+    facts = {"hypotheses": [h.to_dict() for h in found]}
+    chosen: Hypothesis = found[choose(found, options.static, Path(shots[0].source).parent)]
+    facts["static"] = found.index(chosen)
+    progress(f"static scene: hypothesis {facts['static']} with {len(chosen.pairs)} votes, spread {chosen.spread:.2f}")
+    corners: dict[int, int] = {}
+
+    def with_board(model: Model) -> Model:
+        nonlocal corners
+        model, corners = marker_board.with_corners(model, seen)
+        return model
+
+    depends = [chosen.T.tolist(), [sorted((k, v.tolist()) for k, v in m.items()) for m in seen.values()]]
+
+    def make() -> dict:
+        write_model(join(*states, chosen.T, work / "joint", with_board, progress), work / "joined")
+        return {"corners": corners}
+
+    corners = {int(k): v for k, v in cache.get("joint", depends, make, progress)["corners"].items()}
+    return read_model(work / "joined"), corners, facts
+
+
+def _check_arc(model: Model, state: str) -> None:
+    centre, _ = model.centre()
+    mine = [p for p in model.photos.values() if is_end(p.name) == (state == "end")]
+    up = frame.mean_up(model)
+    away = np.array([p.position for p in mine]) - centre
+    x = np.linalg.svd(up[None])[2][1]
+    angles = np.sort(np.degrees(np.arctan2(away @ np.cross(up, x), away @ x)))
+    arc = 360 - np.diff(np.append(angles, angles[0] + 360)).max()
+    if arc < MIN_ARC:
+        raise UserError(f"state '{state}': the photographs go only {arc:.0f} degrees around the object, expected at least {MIN_ARC:.0f}; "
+                        "walk from one side of the front to the other, at two or three heights")  # fmt: skip
+
+
+def _oriented(model: Model, corners: dict[int, int]) -> tuple[Model, dict]:
+    """The model with z up, the floor at 0 and, where there is a board, in metres; what was used for it."""
+    floor, pose = frame.floor_of(model), marker_board.board_pose(model, corners)
+    metres, source, about = 1.0, "object diagonal", {}
+    if pose is not None:
+        T, rms = pose
+        metres, source = 1 / float(np.cbrt(np.linalg.det(T[:3, :3]))), "board"
+        normal = T[:3, 2] * metres
+        normal = normal * np.sign(normal @ frame.mean_up(model))
+        if (
+            normal @ floor.normal < np.cos(np.radians(5)) or floor.source == "cameras"
+        ):  # two measures of one floor: the larger plane is better
+            floor = frame.Floor(normal, float(normal @ T[:3, 3]), "board")
+        about["board_rms_mm"] = round(1000 * rms, 2)
+    return model.moved(frame.to_world(floor, model, metres)), about | {"scale": {"source": source}, "up": floor.source}
+
+
+def _scaled(model: Model, masks: dict[str, np.ndarray], options: Options, about: dict) -> Model:
+    """The model with the object's height, or else its diagonal of 1, where no board gave metres; notes it in ``about``."""
+    scale = about["scale"]
+    if scale["source"] != "board":
+        box = _object_box(model, masks)
+        factor = 1 / float(np.linalg.norm(box[1] - box[0]))
+        if options.height is not None:
+            factor, scale["source"] = options.height / float(box[1, 2]), "height"
+        model = model.moved(np.diag([factor, factor, factor, 1.0]))
+    scale["metric"] = scale["source"] != "object diagonal"
+    return model
+
+
+def _object_box(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
+    """[2, 3] corners of the object by its masks, in the model's coordinates (floor at z = 0)."""
+    import cv2
+    import torch
+
+    from p2gs.data.box import object_box
+    from p2gs.types import Camera, View
+
+    views = []
+    for photo in (p for p in model.photos.values() if p.name in masks):
+        lens = model.lenses[photo.lens]
+        pinhole = write.pinhole_of(lens)
+        alpha = cv2.remap(masks[photo.name], *pinhole.maps, cv2.INTER_NEAREST)
+        camera = Camera(torch.tensor(photo.viewmat).float(), torch.tensor(pinhole.K).float(), lens.width, lens.height)
+        views.append(
+            View(photo.name, int(is_end(photo.name)), "train", camera, torch.empty(0), torch.from_numpy(alpha))
+        )
+    box = object_box(views).double().numpy()
+    box[0, 2] = max(box[0, 2], 0.0)  # the hull of photographs from above goes on below the floor
+    return box
+
+
+def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, box: np.ndarray) -> dict:
+    """What capture.json tells of the images, the states' bias and the colours."""
+    images = []
+    for shot in shots:
+        file = files.get(shot.name)
+        reason = None if file else "could not be placed among the others"
+        images.append({"state": shot.name.split("/")[0], "source": shot.source, "file": file, "reason": reason})
+    images += [{"state": n.split("/")[0], "source": s, "file": None, "reason": why} for n, (s, why) in left_out.items()]
+    bias, (_, distance) = state_bias(model), model.centre()
+    known = bool(np.isfinite(bias.shift))
+    seen = states_of(model)
+    return {
+        "format": FORMAT,
+        "images": images,
+        "bias": {
+            "shift": bias.shift if known else None, "turn_degrees": bias.turn if known else None, "points": bias.points,
+            "share_of_distance": bias.shift / distance if known else None,
+        },
+        "share_of_points_in_both_states": float(seen.all(1).mean()) if len(seen) else 0.0,
+        "lenses": {str(k): {**asdict(lens), "params": lens.params.tolist()} for k, lens in model.lenses.items()},
+        "gains": {files[p.name]: np.exp(found[k]).round(4).tolist() for k, p in model.photos.items() if p.name in files},
+        "object_box": box.tolist(),
+    }  # fmt: skip

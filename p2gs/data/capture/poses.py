@@ -1,0 +1,165 @@
+"""Poses that somebody has already: a COLMAP model or nerfstudio's ``transforms.json``, brought to the copied photographs.
+
+COLMAP's files are what RealityScan, Metashape, VGGT and others export; ``transforms.json`` is what ns-process-data makes of Polycam,
+Record3D, KIRI and others. No pycolmap is needed.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from p2gs.data.capture.colmap_io import find_model, read_model
+from p2gs.data.capture.model import ONE_FOCAL, Lens, Model, Photo
+from p2gs.data.capture.photos import Shot
+from p2gs.data.frames import opengl_pose
+from p2gs.data.report import Report
+from p2gs.types import UserError
+
+KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "distortion_params")
+
+
+def read_poses(path: Path) -> Model:
+    """The model at a path: a ``transforms.json``, a folder that holds one, two in ``start`` and ``end``, or a COLMAP model."""
+    if not path.exists():
+        raise UserError(f"{path}: there are no poses here; expected a COLMAP model's folder or a transforms.json")
+    if path.is_file():
+        return read_transforms([(path, "")])
+    folder = find_model(path)
+    if folder is not None:
+        return read_model(folder)
+    if (path / "transforms.json").is_file():
+        return read_transforms([(path / "transforms.json", "")])
+    both = [(path / state / "transforms.json", f"{state}/") for state in ("start", "end")]
+    if all(file.is_file() for file, _ in both):
+        return read_transforms(both)
+    raise UserError(f"{path}: holds neither cameras.bin or cameras.txt (COLMAP) nor a transforms.json (nerfstudio)")
+
+
+def _frame_lens(meta: dict, frame: dict, where: str) -> Lens:
+    both = {**{k: meta[k] for k in KEYS if k in meta}, **frame}
+    missing = [k for k in ("fl_x", "cx", "cy", "w", "h") if k not in both]
+    if missing:
+        raise UserError(
+            f"{where}: has no {', '.join(missing)}; expected fl_x, fl_y, cx, cy, w, h of the file or of each frame"
+        )
+    kind = meta.get("camera_model", "OPENCV")
+    focal = [float(both["fl_x"]), float(both.get("fl_y", both["fl_x"])), float(both["cx"]), float(both["cy"])]
+    k = {name: float(both.get(name, 0.0)) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    if "distortion_params" in both:
+        k.update(zip(("k1", "k2", "k3", "k4", "p1", "p2"), map(float, both["distortion_params"]), strict=False))
+    size = (int(both["w"]), int(both["h"]))
+    if kind == "OPENCV_FISHEYE":
+        return Lens(kind, *size, np.array([*focal, k["k1"], k["k2"], k["k3"], k["k4"]]))
+    if kind in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        if k["k3"] or k["k4"]:
+            return Lens(
+                "FULL_OPENCV", *size, np.array([*focal, k["k1"], k["k2"], k["p1"], k["p2"], k["k3"], k["k4"], 0, 0])
+            )
+        return Lens("OPENCV", *size, np.array([*focal, k["k1"], k["k2"], k["p1"], k["p2"]]))
+    raise UserError(f"{where}: camera_model {kind} is not known; known: OPENCV, PINHOLE, OPENCV_FISHEYE")
+
+
+def _unapplied(meta: dict, where: str) -> np.ndarray:
+    """[4, 4] that takes the file's coordinates back to those of its reconstruction (undoes ``applied_transform``)."""
+    T = np.eye(4)
+    given = np.asarray(meta.get("applied_transform", T[:3]), float)
+    if given.shape not in ((3, 4), (4, 4)) or abs(np.linalg.det(given[:3, :3])) < 1e-9:
+        raise UserError(f"{where}: applied_transform is not a 3x4 matrix that can be undone")
+    T[:3] = given[:3]
+    return np.linalg.inv(T)
+
+
+def read_transforms(files: list[tuple[Path, str]]) -> Model:
+    """Model without points of nerfstudio files, each with a prefix for its photographs' names. All must share one frame.
+
+    Raises UserError where a file lacks something, naming it.
+    """
+    lenses: dict[int, Lens] = {}
+    photos: dict[int, Photo] = {}
+    known: dict[tuple, int] = {}
+    for path, prefix in files:
+        try:
+            meta = json.loads(path.read_text())
+        except ValueError as err:
+            raise UserError(f"{path}: is not valid JSON ({err})") from err
+        if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
+            raise UserError(f"{path}: has no list 'frames'")
+        undo = _unapplied(meta, str(path))
+        for i, frame in enumerate(meta["frames"]):
+            where = f"{path}: frame {i}"
+            if "file_path" not in frame or "transform_matrix" not in frame:
+                raise UserError(f"{where} needs 'file_path' and 'transform_matrix'")
+            lens = _frame_lens(meta, frame, where)
+            key = known.setdefault((lens.model, lens.width, lens.height, lens.params.tobytes()), len(known) + 1)
+            lenses[key] = lens
+            report, c2w = Report(), np.eye(4)
+            given = np.asarray(frame["transform_matrix"], float)
+            c2w[: given.shape[0]] = given
+            viewmat = opengl_pose(_rigid(undo @ c2w), where, report)
+            if viewmat is None:
+                raise UserError(report.findings[0].message)
+            photos[len(photos) + 1] = Photo(prefix + frame["file_path"], key, viewmat)
+    none = np.zeros(0, np.int64)
+    return Model(lenses, photos, none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
+def _rigid(c2w: np.ndarray) -> np.ndarray:
+    """The pose with the scale of an applied transform taken out of its rotation."""
+    out = c2w.copy()
+    out[:3, :3] /= np.cbrt(abs(np.linalg.det(c2w[:3, :3])))
+    return out
+
+
+def state_of(name: str, start: Path, end: Path, in_start: bool, in_end: bool) -> str | None:
+    """'start' or 'end' for a photograph's name, by the folder that has such a file, else by the folders in its name; None for neither."""
+    if in_start != in_end:
+        return "start" if in_start else "end"
+    if not in_start:
+        return None
+    folders = PurePosixPath(name).parts[:-1]
+    for state, folder in (("start", start), ("end", end)):
+        if state in folders or folder.name in folders:
+            return state
+    raise UserError(
+        f"poses: {name} may belong to either state; put the photographs into folders start/ and end/ before solving the poses"
+    )
+
+
+def onto_copies(model: Model, shots: list[Shot], start: Path, end: Path) -> Model:
+    """The model of the photographs that were copied: its images named, its lenses scaled to the copies' size.
+
+    Raises UserError where fewer than two photographs of a state are found, or sizes do not belong together.
+    """
+    by_file = {(s.name.split("/")[0], Path(s.source).name): s for s in shots}
+    photos, lenses = {}, {}
+    for key, photo in model.photos.items():
+        file = PurePosixPath(photo.name).name
+        there = [("start", file) in by_file, ("end", file) in by_file]
+        state = state_of(photo.name, start, end, *there)
+        if state is None:
+            continue
+        shot, lens = by_file[state, file], model.lenses[photo.lens]
+        factor = shot.width / lens.width
+        if abs(lens.height * factor - shot.height) > 2:
+            raise UserError(
+                f"{shot.source}: is {shot.width}x{shot.height} upright, its pose is for {lens.width}x{lens.height} pixels; "
+                "solve the poses with upright photographs"
+            )
+        params = lens.params.copy()
+        params[: 3 if lens.model in ONE_FOCAL else 4] *= factor
+        number = photo.lens * 2 + (state == "end")
+        lenses[number] = Lens(lens.model, shot.width, shot.height, params)
+        photos[key] = replace(photo, name=shot.name, lens=number, xy=photo.xy * factor)
+    for state in ("start", "end"):
+        if sum(p.name.startswith(state) for p in photos.values()) < 2:
+            folder = start if state == "start" else end
+            raise UserError(
+                f"{folder}: the poses name none or only one of its photographs; expected the same file names"
+            )
+    used = np.unique(np.concatenate([p.point[p.point >= 0] for p in photos.values()]))
+    keep = np.isin(model.ids, used)
+    return Model(lenses, photos, model.ids[keep], model.xyz[keep], model.rgb[keep])

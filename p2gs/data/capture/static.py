@@ -1,0 +1,87 @@
+"""Which hypothesis is the room: the decision, and the sentences for captures that leave it open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from p2gs.data.capture import board as marker_board
+from p2gs.data.capture.hypotheses import MIN_VOTES, RIVAL, Hypothesis, State, extent, find_hypotheses
+from p2gs.data.capture.joint import guided_pairs, states_of
+from p2gs.data.capture.model import Model
+from p2gs.types import UserError
+
+SAME = 0.04  # of the cameras' distance: hypotheses that move the object's place by less than this are one; a board alone is as exact
+ADVICE = "lay newspapers, a patterned rug or the printed board (p2gs data board) around the object and photograph both states again"
+
+
+def apart(model: Model, A: np.ndarray, B: np.ndarray) -> float:
+    """How far two similarities start -> end put the object's surroundings apart, over the cameras' distance."""
+    centre, distance = model.centre()
+    offsets = np.vstack([np.zeros(3), 0.3 * distance * np.eye(3), -0.3 * distance * np.eye(3)])
+    points = centre + offsets
+    between = points @ (A - B)[:3, :3].T + (A - B)[:3, 3]
+    scale = np.cbrt(np.linalg.det(A[:3, :3]))
+    return float(np.linalg.norm(between, axis=1).max() / (scale * distance))
+
+
+def hypotheses_of(start: State, end: State, seen: dict) -> list[Hypothesis]:
+    """All hypotheses, widest first; each told whether the board agrees. The board's own is added where no other agrees with it."""
+    found = find_hypotheses(start, end)
+    T = marker_board.board_similarity(start.model, end.model, seen)
+    if T is None:
+        return found
+    found = [replace(h, board=apart(start.model, h.T, T) < SAME) for h in found]
+    if not any(h.board for h in found):
+        pairs = guided_pairs(start, end, T)
+        if len(pairs):
+            found.append(Hypothesis(T, pairs, *extent(start.model, pairs[:, 0]), board=True))
+    return found
+
+
+def choose(found: list[Hypothesis], given: int | None, where: Path) -> int:
+    """Index of the static hypothesis. given: the user's choice. Raises UserError, with what to do, where none can be trusted."""
+    if given is not None:
+        if not 0 <= given < len(found):
+            raise UserError(f"--static {given}: there are {len(found)} hypotheses, counted from 0")
+        return given
+    if any(h.board for h in found):
+        return max((i for i, h in enumerate(found) if h.board), key=lambda i: len(found[i].pairs))
+    if not found:
+        raise UserError(f"{where}: the two states show too little in common (fewer than {MIN_VOTES} points); {ADVICE}")
+    if not found[0].wide:
+        raise UserError(
+            f"{where}: what both states show in common reaches over {found[0].spread:.2f} of the cameras' distance only, "
+            f"so it may be a moving part and not the room; {ADVICE}"
+        )
+    rivals = [i for i, h in enumerate(found[1:], 1) if h.wide and h.spread > RIVAL * found[0].spread]
+    if rivals:
+        raise UserError(
+            f"{where}: hypotheses 0 and {rivals[0]} both reach through the room, so something large moved besides the parts; "
+            f"leave the room as it is, or choose with --static 0 or --static {rivals[0]}"
+        )
+    return 0
+
+
+def check_joint_support(model: Model) -> dict:
+    """Where the points lie that both states show, for poses that somebody else solved. Raises UserError where they are confined.
+
+    A model without points says nothing, and neither does this.
+    """
+    if len(model.ids) == 0:
+        return {"points": 0}
+    rows = np.flatnonzero(states_of(model).all(1))
+    if len(rows) < MIN_VOTES:
+        raise UserError(
+            f"the poses' two states share {len(rows)} points, expected at least {MIN_VOTES}: they need not lie in one frame; {ADVICE}"
+        )
+    spread, outside = extent(model, rows)
+    support = Hypothesis(np.eye(4), np.stack([rows, rows], 1), spread, outside)
+    if not support.wide:
+        raise UserError(
+            f"the points that both states of these poses share reach over {spread:.2f} of the cameras' distance only, "
+            f"so the open state may hang on a moving part; {ADVICE}"
+        )
+    return {"points": len(rows), "spread": spread, "outside": outside}

@@ -1,0 +1,136 @@
+"""Masks from 3D on a small room whose object is known, and given masks."""
+
+import numpy as np
+import pytest
+import torch
+
+from p2gs.data.capture.auto_masks import distorted, sharpened
+from p2gs.data.capture.coarse import Picture, fit, initial, object_rows, region_of
+from p2gs.data.capture.given_masks import folder_masks, shown
+from p2gs.data.capture.model import Lens
+from p2gs.data.capture.photos import Shot
+from p2gs.data.raytrace import render
+from p2gs.data.shapes import box
+from p2gs.data.textures import Texture
+from p2gs.types import Camera, UserError
+
+K = np.array([[110.0, 0, 64], [0, 110, 48], [0, 0, 1]])
+
+
+def look_at(position, target):
+    z = np.asarray(target, float) - position
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = R, -R @ position
+    return view
+
+
+def room():
+    """Floor, a wall behind, a box on the floor aside, and the object (part 1) before the cameras."""
+    floor = box((-3, -3, -0.05), (3, 3, 0), Texture("checks", (0.6, 0.5, 0.3), (0.3, 0.3, 0.5), 0.5, 1))
+    wall = box((-1.1, -3, 0), (-1.0, 3, 2.5), Texture("noise", (0.8, 0.8, 0.7), (0.4, 0.6, 0.4), 0.6, 2))
+    aside = box((-0.8, 0.9, 0), (-0.4, 1.3, 0.35), Texture("checks", (0.2, 0.8, 0.3), (0.9, 0.9, 0.2), 0.2, 3))
+    thing = box((-0.3, -0.3, 0), (0.3, 0.3, 0.7), Texture("noise", (0.8, 0.15, 0.1), (0.6, 0.1, 0.1), 0.3, 4))
+    return [floor, wall, aside, thing], [0, 0, 0, 1]
+
+
+def test_the_object_is_told_from_the_room():
+    primitives, parts = room()
+    pictures, truths, points = [], [], []
+    for i, angle in enumerate(np.linspace(-1.2, 1.2, 18)):
+        view = look_at(np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), (0.6, 1.1, 1.6)[i % 3]]), (0, 0, 0.35))
+        shot = render(primitives, parts, view, K, 128, 96, samples=1)
+        pictures.append(
+            Picture(
+                Camera(torch.tensor(view).float(), torch.tensor(K).float(), 128, 96),
+                torch.from_numpy(shot.image).float() / 255,
+            )
+        )
+        truths.append(shot.parts == 1)
+        v, u = np.nonzero((shot.depth > 0) & (np.random.default_rng(i).random(shot.depth.shape) < 0.01))
+        local = (
+            np.stack([(u + 0.5 - K[0, 2]) / K[0, 0], (v + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(u))], 1)
+            * shot.depth[v, u, None]
+        )
+        points.append((local - view[:3, 3]) @ view[:3, :3])
+    xyz = np.concatenate(points)
+    cameras = np.array([p.camera.position.numpy() for p in pictures])
+    region = region_of(xyz, cameras, np.array([0, 0, 0.35]), 2.2)
+    assert len(region.planes) == 2  # floor and wall
+    assert abs(region.planes[1] @ [1, 0, 0, 0]) > 0.99 and abs(region.planes[1][3] + 1.0) < 0.02
+    splat = initial(region, xyz, np.full((len(xyz), 3), 128, np.uint8))
+    fit(splat, pictures, region.distance, steps=250)
+    rows = object_rows(splat, region)
+    overlaps = []
+    for picture, truth in zip(pictures, truths, strict=True):
+        with torch.no_grad():
+            share = splat.render(picture.camera, features=rows[:, None].float()).features[..., 0].numpy() > 0.5
+        overlaps.append((share & truth).sum() / (share | truth).sum())
+    assert np.median(overlaps) > 0.8, overlaps
+
+
+def test_sharpening_moves_an_edge_to_the_picture_and_not_further():
+    image = np.full((90, 120, 3), 60, np.uint8) + np.random.default_rng(0).integers(0, 12, (90, 120, 3)).astype(
+        np.uint8
+    )
+    image[20:70, 30:90] += 120
+    share = np.zeros((90, 120))
+    share[22:70, 30:88] = 1  # two pixels short at two sides
+    cut = sharpened(image, share)
+    truth = np.zeros((90, 120), bool)
+    truth[20:70, 30:90] = True
+    assert (cut != truth).sum() < 0.25 * ((share > 0.5) != truth).sum()
+    flat = np.full((90, 120, 3), 100, np.uint8)
+    assert (sharpened(flat, share) != (share > 0.5)).sum() <= 0.15 * share.sum()
+
+
+def test_a_mask_goes_back_through_the_lens():
+    lens = Lens("OPENCV", 320, 240, np.array([260.0, 260, 160, 120, -0.08, 0.01, 0, 0]))
+    from p2gs.data.capture.write import pinhole_of
+
+    pinhole = pinhole_of(lens)
+    ray = np.array([[0.3, -0.2, 1.0]])
+    u, v = (pinhole.K @ ray[0])[:2]
+    mask = np.zeros((240, 320), bool)
+    mask[int(v) - 4 : int(v) + 4, int(u) - 4 : int(u) + 4] = True
+    out = distorted(mask, lens)
+    rows, cols = np.nonzero(out)
+    x, y = lens.project(ray)[0]
+    assert abs(cols.mean() + 0.5 - x) < 1.0 and abs(rows.mean() + 0.5 - y) < 1.0
+
+
+def shots(count=8):
+    return [
+        Shot(f"{s}/{i:04d}.jpg", f"/x/{s}/IMG_{i}.jpg", 40, 30, None, "", 1.0)
+        for s in ("start", "end")
+        for i in range(count)
+    ]
+
+
+def test_given_masks_are_found_by_name_and_scaled(tmp_path):
+    import cv2
+
+    for shot in shots():
+        state, stem = shot.name.split("/")[0], shot.source.split("/")[-1]
+        (tmp_path / state).mkdir(exist_ok=True)
+        mask = np.zeros((60, 80), np.uint8)
+        mask[20:40, 20:60] = 255
+        cv2.imwrite(str(tmp_path / state / f"{stem}.png"), mask)  # a.jpg.png
+    found = folder_masks(shots(), tmp_path)
+    assert len(found) == 16 and all(m.shape == (30, 40) and (m > 127).sum() == 200 for m in found.values())
+    (tmp_path / "start/IMG_3.jpg.png").unlink()
+    with pytest.raises(UserError, match="IMG_3.jpg"):
+        folder_masks(shots(), tmp_path)
+
+
+def test_empty_masks_are_left_out_and_too_many_refused(tmp_path):
+    masks = {s.name: np.full((4, 4), 255, np.uint8) for s in shots(10)}
+    masks["start/0000.jpg"][:] = 0
+    assert len(shown(masks, tmp_path)) == 19
+    for i in range(5):
+        masks[f"end/{i:04d}.jpg"][:] = 0
+    with pytest.raises(UserError, match="5 of 10 masks are empty"):
+        shown(masks, tmp_path)
