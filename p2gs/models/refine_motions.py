@@ -14,7 +14,7 @@ from p2gs.models.handover import PartMotions
 from p2gs.models.screw_polish import PolishConfig, Side, allowed_step, apply_step, photometric_cost, polish
 from p2gs.ops import se3
 
-NOISE = 0.01  # change of the mean landing cost (0..1) that is none: the true motions of zoo objects differ by less from those found beside them
+NOISE = 0.04  # change of the mean landing cost (0..1) that is none: so much worse land a zoo object's true motions than the best ones beside them
 
 
 def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor:
@@ -53,13 +53,13 @@ def refine(
 
 
 def uncontradicted(states, motions: PartMotions, refined: Tensor, surfaces: SurfaceStacks) -> Tensor:
-    """Of the refined motions [K-1, 4, 4] those under which a part's surface arrives as well as before, to within ``NOISE``; of the others
-    what they were: where the states show different sides of a plate, photographs pull it to where neither state has its surface."""
+    """The refined motions [K-1, 4, 4], but of plates of which the states show different sides (to know the other side explains more than
+    ``NOISE``) what they were where the surface arrives worse now: photographs pull such a plate to where neither state has it."""
     labels = surfaces.surfel_labels([s.gaussians.means.detach().cpu() for s in states], motions.labels)
     out = refined.clone()
     for k in range(len(motions)):
-        before, after = (surfaces.arrival(labels, T, motions.types, k) for T in (motions.transforms, refined))
-        if after > before + NOISE:
+        (before, other_side), (after, _) = (surfaces.arrival(labels, T, motions.types, k) for T in (motions.transforms, refined))
+        if other_side > NOISE and after > before + NOISE:
             out[k] = motions.transforms[k]
     return out
 

@@ -130,18 +130,21 @@ class SurfaceStacks(list):
         super().__init__(problem.stacks if stacks is None else stacks)
         self.problem = problem
 
-    def arrival(self, labels: list[Tensor], transforms: Tensor, types: list[str], part: int) -> float:
-        """Mean landing cost (0..1, both states alike) of a part's surfels under its motion, the thickness of plate chosen to suit it.
+    def arrival(self, labels: list[Tensor], transforms: Tensor, types: list[str], part: int) -> tuple[float, float]:
+        """Mean landing cost (0..1, both states alike) of a part's surfels under its motion, the thickness of plate chosen to suit it; and how
+        much of it knowing the plate's other side saves.
 
         labels: part of each surfel of both states (0 static).  transforms [K, 4, 4].
         """
-        motion = sided(self.problem, as_motions(transforms[part : part + 1], types[part : part + 1]))
+        plain = as_motions(transforms[part : part + 1], types[part : part + 1])
+        both = Motions.cat([sided(self.problem, plain), plain])
         costs = []
         for s in (0, 1):
             index = (labels[s] == part + 1).nonzero().squeeze(1)
             if len(index):
-                costs.append(float(self.problem.cost(motion, s, index)[0].mean()))
-        return sum(costs) / max(len(costs), 1)
+                costs.append(self.problem.cost(both, s, index)[0].mean(1))
+        cost, one_sided = (sum(costs) / len(costs)).tolist() if costs else (0.0, 0.0)
+        return cost, one_sided - cost
 
     def surfel_labels(self, gaussians: list[Tensor], labels: list[Tensor]) -> list[Tensor]:
         """Label of the Gaussian (means [N, 3], labels [N], by state) next to each surfel."""
