@@ -1,11 +1,10 @@
 """The oracle ladder of part discovery: which step loses which joint? A bench tool that reads ground truth, which no phase may.
 
-    python bench/ladder.py RUN... [--truth] [--out FILE]
+    python bench/ladder.py RUN... [--zoo DIR] [--out FILE]
 
-RUN holds the single states of a scene (``p2gs fit ... --only single_state``). Discovery is run from them, anew, and its joints are held against the
-true ones: found (right type, axis <= 1 deg, position x10 <= 0.15, motion <= 1 deg or 0.01, or a listed tie), and what each step had.
-``--truth`` also hands in the true motions: their energy beside that of what was found, and how far refinement carries them away.
-A line of JSON per run goes to FILE.
+RUN holds the single states of a scene (``p2gs fit ... --only single_state``). Discovery is run from them, anew, with this build's defaults,
+and its joints are held against the true ones: right is type, axis <= 1 deg, position x10 <= 0.15, motion <= 1 deg or 0.01, or a listed tie.
+A line of JSON per run goes to FILE. DIR: the zoo's lists of scenes and ties.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import yaml
 
 from p2gs.config import load_config
 from p2gs.data.ground_truth import load_ground_truth
-from p2gs.metrics.joints import evaluate_joints
+from p2gs.metrics.joints import evaluate_joints, joint_errors
 from p2gs.models import handover
 from p2gs.models.part_motions import find_part_motions
 from p2gs.ops import se3
@@ -31,14 +30,8 @@ from p2gs.pipeline import Pipeline
 RIGHT = {"axis_angle": 1.0, "axis_position": 0.15, "turn": 1.0, "slide": 0.01}  # the field's bounds of a right joint
 
 
-def to_internal(T: torch.Tensor, similarity) -> torch.Tensor:
-    """A motion [4, 4] of the input's world in training units."""
-    c = torch.as_tensor(similarity.center, dtype=torch.float64)
-    return se3.make(T[:3, :3], similarity.scale * (T[:3, 3] + T[:3, :3] @ c - c))
-
-
 def to_input(T: torch.Tensor, similarity) -> torch.Tensor:
-    """The reverse of ``to_internal``."""
+    """A motion [4, 4] in training units as one of the input's world."""
     c = torch.as_tensor(similarity.center, dtype=torch.float64)
     return se3.make(T[:3, :3], T[:3, 3] / similarity.scale + c - T[:3, :3] @ c)
 
@@ -60,8 +53,6 @@ def ties_of(name: str, zoo: Path) -> dict[str, list[float]]:
 
 def is_right(score, gt, pred, others: list[float]) -> bool:
     """Within ``RIGHT`` of the true joint, or of one with another turn that no picture tells from it."""
-    from p2gs.metrics.joints import joint_errors
-
     if score.failed:
         return False
     for motion in [gt.motion, *others]:
@@ -77,8 +68,8 @@ class Case:
 
     def __init__(self, run: Path, zoo: Path, preset: str = "configs/preset/cpu.yaml"):
         self.name = run.name
-        told = yaml.safe_load((run / "config.yaml").read_text())  # only where the scene is: this build's own defaults are what is measured
-        self.pipeline = Pipeline(load_config([preset], ["--data.root", told["data"]["root"], "--data.depth", "never", "--run", str(run)]))
+        root = yaml.safe_load((run / "config.yaml").read_text())["data"]["root"]  # all else is this build's default
+        self.pipeline = Pipeline(load_config([preset], ["--data.root", root, "--data.depth", "never", "--run", str(run)]))
         self.states = [handover.load(run / "checkpoints" / f"single_state_{s}.pt")[0] for s in (0, 1)]
         self.scene, self.cfg = self.pipeline.scene, self.pipeline.cfg
         self.truth = load_ground_truth(self.cfg.data.root)
@@ -90,11 +81,6 @@ class Case:
     def similarity(self):
         return self.scene.similarity
 
-    def true_motions(self) -> tuple[torch.Tensor, list[str]]:
-        """[K, 4, 4] in training units, and the types."""
-        joints = self.truth.joints
-        return torch.stack([to_internal(j.transform.double(), self.similarity) for j in joints]), [j.type for j in joints]
-
     def score(self, transforms: torch.Tensor, types: list[str]) -> dict:
         """Each true joint's errors and whether it is right; how many parts are too many."""
         found = [joint_of(to_input(T.double(), self.similarity), kind) for T, kind in zip(transforms, types, strict=True)]
@@ -104,7 +90,10 @@ class Case:
             others = self.ties.get(self.joints[s.gt], []) if self.joints else []
             right = is_right(s, self.truth.joints[s.gt], found[s.pred] if s.pred is not None else None, others)
             e = s.errors
-            errors = None if e is None else [round(e.axis_angle, 3), None if e.axis_position is None else round(e.axis_position, 3), round(e.motion, 4)]
+            errors = None
+            if e is not None:
+                position = None if e.axis_position is None else round(e.axis_position, 3)
+                errors = [round(e.axis_angle, 3), position, round(e.motion, 4)]
             rows.append({"joint": s.gt, "type": s.type, "pred": s.pred, "right": right, "errors": errors})
         return {"right": sum(r["right"] for r in rows), "of": len(rows), "extra": len(report.extra), "joints": rows}
 
@@ -122,7 +111,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--zoo", type=Path, default=Path("../shared/zoo"))
-    parser.add_argument("--truth", action="store_true")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
@@ -132,7 +120,8 @@ def main() -> None:
         motions, seconds = case.discover()
         row = {"name": case.name, "seconds": round(seconds, 1), **case.score(motions.transforms, motions.types)}
         row["found"] = [[t, round(float(c), 3)] for t, c in zip(motions.types, motions.confidence, strict=True)]
-        print(f"{row['name']}: {row['right']} of {row['of']} right, {row['extra']} too many, {row['seconds']} s", row["joints"], row["found"], flush=True)
+        told = f"{row['name']}: {row['right']} of {row['of']} right, {row['extra']} too many, {row['seconds']} s"
+        print(told, row["joints"], row["found"], flush=True)
         if args.out:
             with args.out.open("a") as f:
                 f.write(json.dumps(row) + "\n")

@@ -26,8 +26,8 @@ STOPS = 9  # points looked at on each line
 
 @dataclass
 class Surfaces:
-    """Surface points [N, 3] of both states with the parts [N] that they belong to (0 static), how far apart they lie, and the states' rendered depth
-    with its tolerance along the ray (internal units)."""
+    """Surface points [N, 3] of both states with the parts [N] that they belong to (0 static), how far apart they lie, and the states'
+    rendered depth with its tolerance along the ray (internal units)."""
 
     points: list[Tensor]
     labels: list[Tensor]

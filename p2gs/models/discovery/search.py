@@ -25,7 +25,7 @@ THICKNESSES = 8  # of plates that are tried
 
 
 def two_sided(problem: Problem, motions: Motions, gain: Callable[[Motions], Tensor]) -> Motions:
-    """The motions with the thickness of plate under which ``gain`` [B] is greatest; slides show the same sides in both states and keep 0."""
+    """The motions with the thickness of plate under which ``gain`` [B] is greatest; slides show the same sides in both states: 0."""
     turns = motions.turn.nonzero()[:, 0]
     if not len(turns):
         return motions
