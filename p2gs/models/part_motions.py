@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
+from p2gs.models.bodies import Surfaces, one_part_a_body
 from p2gs.models.discovery import Discovery, DiscoveryConfig, discover, relabel, surface_energy
 from p2gs.models.discovery.pipeline import SurfaceStacks
 from p2gs.models.evidence import gather_evidence
@@ -22,7 +23,6 @@ from p2gs.models.refine_motions import explanation_cost, leave_false_minima, ref
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.models.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
 from p2gs.ops import se3
-from p2gs.parts.bodies import Surfaces, one_part_a_body
 from p2gs.types import TwoStateScene, UserError
 
 

@@ -1,1 +1,0 @@
-"""What makes a part one part: one body with one motion."""
