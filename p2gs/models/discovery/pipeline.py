@@ -199,7 +199,7 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
         if tried[k][0] < cfg.split:
             break
         more, relabelled = settle_parts(problem, graphs, with_amounts(motions, k, *tried[k][1:]), axes)
-        if min(masses(problem, relabelled)) < cfg.min_mass or twins(problem, more, relabelled) is not None:
+        if min(masses(problem, relabelled)) < cfg.min_mass or same_motion(problem, more, k, len(more) - 1):
             break
         motions, labelling = more, relabelled
     while len(motions):
@@ -268,6 +268,12 @@ def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> flo
     pays = [p for p, _ in problem.pay(motions)]
     doubt = float((torch.tensor(masses(problem, labelling)) * (1 - plausibility(problem, motions, pays, problem.samples, False))).sum())
     return image_score(problem, motions, labelling) + problem.config.part_cost * len(motions) + 0.5 * doubt
+
+
+def same_motion(problem: Problem, motions: Motions, i: int, j: int) -> bool:
+    """Do two motions differ by less than the surfaces' own disagreement?"""
+    probe = torch.cat([problem.surfels[s].points[problem.samples[s]] for s in (0, 1)])
+    return float(motions[i : i + 1].swept(probe, motions[j : j + 1])) < 0.7 * problem.scale.tp
 
 
 def twins(problem: Problem, motions: Motions, labelling: Labelling) -> int | None:
