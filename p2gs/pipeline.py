@@ -23,7 +23,7 @@ from p2gs.models import handover
 from p2gs.models.articulation import ArticulationPhase
 from p2gs.models.canonical_fusion import CanonicalFusionPhase
 from p2gs.models.diagnosis import StageResults
-from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.discovery.evidence import DepthStack, StateEvidence
 from p2gs.models.discovery.problem import Problem, build_problem
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.finish import finish
@@ -245,14 +245,12 @@ class Pipeline:
         """found_in: the states before they were sharpened: an overfitted lid explains noise that no wall behind it does."""
         stacks, counted = None, {}
         if motions is not None and len(motions) and section.config.canonical.free_space > 0:
-            found, backend = self.cfg.phases["discovery"].config, {"backend": self.cfg.rasterizer, "device": self.device}
-            size = (found.evidence_size, found.min_opacity)
-            train = [self.scene.select(state=s.state, split="train") for s in states]
-            seen = [gather_evidence(s.gaussians, v, *size, **backend) for s, v in zip(found_in, train, strict=True)]
-            stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in seen]
+            backend = {"backend": self.cfg.rasterizer, "device": self.device}
+            stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in self.evidence(found_in)]
             if section.config.owners:
                 motions, counted["owners"] = hidden_to_owners(found_in, motions, stacks, **backend)
-            told = any(v.depth is not None for views in train for v in views)  # where depth is given nothing is open
+            train = self.scene.select(split="train")
+            told = any(v.depth is not None for v in train)  # where depth is given nothing is open
             if section.config.openings.may_lose > 0 and not told:
                 openings, motions, stacks, lids = open_up(found_in, motions, self.views, stacks, section.config.openings, **backend)
                 states = [opening.of(s) for opening, s in zip(openings, states, strict=True)]
@@ -263,14 +261,16 @@ class Pipeline:
         options = {"stacks": stacks, "counted": counted, "num_parts": known, **self.common()}
         return CanonicalFusionPhase(section.config, section.losses, states, motions, self.views, **options)
 
+    def evidence(self, states) -> list[StateEvidence]:
+        """What discovery looks at of each state."""
+        found, options = self.cfg.phases["discovery"].config, {"backend": self.cfg.rasterizer, "device": self.device}
+        train = [self.scene.select(state=s.state, split="train") for s in states]
+        size = (found.evidence_size, found.min_opacity)
+        return [gather_evidence(s.gaussians, v, *size, **options) for s, v in zip(states, train, strict=True)]
+
     def surfaces(self, states) -> Problem:
         """The surfaces of both states as discovery sees them."""
-        found, evidence = self.cfg.phases["discovery"].config, []
-        for s in states:
-            views = self.scene.select(state=s.state, split="train")
-            size, options = (found.evidence_size, found.min_opacity), {"backend": self.cfg.rasterizer, "device": self.device}
-            evidence.append(gather_evidence(s.gaussians, views, *size, **options))
-        return build_problem(*evidence, found.search, self.cfg.seed)[0]
+        return build_problem(*self.evidence(states), self.cfg.phases["discovery"].config.search, self.cfg.seed)[0]
 
     def articulate(self, canonical, states, motions, section) -> Phase:
         extent = float((self.scene.box[1] - self.scene.box[0]).norm())
@@ -345,7 +345,7 @@ class Pipeline:
             backend=self.backend,
             twin_backend=self.cfg.rasterizer,
             contents=in_trays,
-            problem=self.surfaces(found_in),
+            problem=self.surfaces(found_in) if learned.types and config.polish.steps > 0 else None,
             device=device,
         )
         for note in notes:

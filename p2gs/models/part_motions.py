@@ -122,7 +122,7 @@ def find_part_motions(
 
         def first_look(explanation) -> float:
             motions = refine(states, _label_states(explanation, states), views, quick, stacks, **options)
-            return energy(found, states, motions, views, quick.levels[0], backend, device)
+            return energy(found, motions, explanation_cost(states, motions, views, quick.levels[0], backend, device))
 
         looks = [first_look(e) for e in explanations]
         order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
@@ -135,8 +135,8 @@ def find_part_motions(
         motions = refine(states, motions, views, config.coarse, stacks, **options)
         reductions: list[dict] = []
         motions = simplify(states, motions, views, config, backend=backend, device=device, log=reductions)
-        rank = energy(found, states, motions, views, level, backend, device)
         cost = explanation_cost(states, motions, views, level, backend, device)
+        rank = energy(found, motions, cost)
         tried.append({"types": motions.types, "cost": cost, "rank": rank, "value": explanation.value, "reductions": reductions})
         refined.append((rank, number, motions))
     contenders = _contenders(refined, config)
@@ -154,7 +154,7 @@ def find_part_motions(
             motions, reconsidered = reconsider(found, states, motions, views, config, stacks, limit, **options)
             changed += reconsidered
             motions = simplify(states, motions, views, config, backend=backend, device=device, log=changed)
-        rank = energy(found, states, motions, views, level, backend, device)
+        rank = energy(found, motions, explanation_cost(states, motions, views, level, backend, device))
         contests.append({"explanation": number, "types": motions.types, "rank": rank})
         ends.append((number, motions, shifted, changed))
     number, motions, shifted, changed = ends[min(range(len(ends)), key=lambda i: contests[i]["rank"])]
@@ -186,10 +186,9 @@ def labelled_surfaces(found: Discovery, transforms: Tensor, types: list[str]) ->
     return Surfaces(points, labels, problem.scale.spacing, problem.stacks, problem.scale.tau)
 
 
-def energy(found, states, motions: PartMotions, views, level: int, backend: str, device="cpu") -> float:
-    """One number by which explanations are compared, lower is better: the logarithm of the image loss (both ways) plus what the surfaces say
-    (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained."""
-    loss = explanation_cost(states, motions, views, level, backend, device)
+def energy(found: Discovery, motions: PartMotions, loss: float) -> float:
+    """One number by which explanations are compared, lower is better: the logarithm of the image loss (``explanation_cost``) plus what the
+    surfaces say (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained."""
     return math.log(max(loss, 1e-9)) + surface_energy(found, motions.transforms, motions.types)
 
 

@@ -11,21 +11,11 @@ from p2gs.data.capture.model import Lens
 from p2gs.data.capture.photos import Shot
 from p2gs.data.raytrace import render
 from p2gs.data.shapes import box
+from p2gs.data.synthetic import look_at
 from p2gs.data.textures import Texture
 from p2gs.types import Camera, UserError
 
 K = np.array([[110.0, 0, 64], [0, 110, 48], [0, 0, 1]])
-
-
-def look_at(position, target):
-    z = np.asarray(target, float) - position
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = R, -R @ position
-    return view
 
 
 def room():

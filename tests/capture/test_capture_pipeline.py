@@ -16,22 +16,12 @@ from p2gs.data.capture.model import Lens, Model, Photo
 from p2gs.data.check import check_dataset
 from p2gs.data.raytrace import render
 from p2gs.data.shapes import box
+from p2gs.data.synthetic import look_at
 from p2gs.data.textures import Texture
 from p2gs.export.evaluate_capture import camera_pairs, moved_joint, rigid_between
 from p2gs.types import Joint, UserError
 
 LENS = Lens("PINHOLE", 320, 240, np.array([280.0, 280, 160, 120]))
-
-
-def look_at(position, target):
-    z = np.asarray(target, float) - position
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = R, -R @ position
-    return view
 
 
 @pytest.fixture(scope="module")

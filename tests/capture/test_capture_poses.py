@@ -11,20 +11,10 @@ from p2gs.data.capture.colmap_io import read_model, write_model
 from p2gs.data.capture.model import Lens, Model, Photo, similarity
 from p2gs.data.capture.photos import copy_photos
 from p2gs.data.capture.poses import onto_copies, read_poses
+from p2gs.data.synthetic import look_at
 from p2gs.types import UserError
 
 LENS = Lens("OPENCV", 320, 240, np.array([300.0, 302, 161, 119, -0.05, 0.01, 0.001, -0.001]))
-
-
-def look_at(position, target=(0, 0, 0.4)):
-    z = np.array(target, float) - position
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = R, -R @ position
-    return view
 
 
 def small_model(per_state=8, points=60, names="{state}/{i}.jpg"):
@@ -39,7 +29,7 @@ def small_model(per_state=8, points=60, names="{state}/{i}.jpg"):
             key += 1
             angle = 2.4 * i / per_state - 1.2 + 0.05 * s
             photos[key] = Photo(
-                names.format(state=state, i=i), 3, look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.2]))
+                names.format(state=state, i=i), 3, look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.2]), (0, 0, 0.4))
             )
             pixels = model.pixels_of(key, xyz)
             inside = (pixels > 0).all(1) & (pixels < [320, 240]).all(1)

@@ -14,21 +14,11 @@ from p2gs.data.capture.hypotheses import State, find_hypotheses
 from p2gs.data.capture.joint import END_OFFSET, filtered, guided_pairs, merged, state_bias, states_of
 from p2gs.data.capture.model import Lens, Model, Photo
 from p2gs.data.capture.static import choose
+from p2gs.data.synthetic import look_at
 from p2gs.types import UserError
 
 LENS = Lens("OPENCV", 960, 720, np.array([750.0, 750, 480, 360, -0.04, 0.01, 0, 0]))
 DRAWER_MOTION = np.array([0.3, 0.0, 0.0])
-
-
-def look_at(position, target):
-    z = np.asarray(target, float) - position
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = R, -R @ position
-    return view
 
 
 def reconstruction(xyz, descriptors, state, seed, T=None, noise=0.3):
