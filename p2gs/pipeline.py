@@ -24,7 +24,6 @@ from p2gs.models.articulation import ArticulationPhase
 from p2gs.models.canonical_fusion import CanonicalFusionPhase
 from p2gs.models.diagnosis import StageResults
 from p2gs.models.discovery.evidence import DepthStack, StateEvidence
-from p2gs.models.discovery.problem import Problem, build_problem
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.finish import finish
 from p2gs.models.openings import open_up
@@ -268,10 +267,6 @@ class Pipeline:
         size = (found.evidence_size, found.min_opacity)
         return [gather_evidence(s.gaussians, v, *size, **options) for s, v in zip(states, train, strict=True)]
 
-    def surfaces(self, states) -> Problem:
-        """The surfaces of both states as discovery sees them."""
-        return build_problem(*self.evidence(states), self.cfg.phases["discovery"].config.search, self.cfg.seed)[0]
-
     def articulate(self, canonical, states, motions, section) -> Phase:
         extent = float((self.scene.box[1] - self.scene.box[0]).norm())
         parts = len(motions) + 1 if motions is not None and not self.exact else self.cfg.num_parts
@@ -345,7 +340,6 @@ class Pipeline:
             backend=self.backend,
             twin_backend=self.cfg.rasterizer,
             contents=in_trays,
-            problem=self.surfaces(found_in) if learned.types and config.polish.steps > 0 else None,
             device=device,
         )
         for note in notes:

@@ -12,8 +12,6 @@ from p2gs.data.views import TrainingViews
 from p2gs.losses.base import Loss
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.discovery.pipeline import SurfaceStacks
-from p2gs.models.discovery.problem import Problem
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.islands import settle_twin_islands
 from p2gs.models.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
@@ -50,7 +48,7 @@ class FinishConfig:
     Gaussians, this the radius (input units; 0 = off; ArtGS cleans real scans so, with 0.05).
     """
 
-    polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0, rim=2.0))
+    polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0))
     tune: TuneConfig = field(default_factory=TuneConfig)
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     min_mass: float = 0.002
@@ -170,14 +168,12 @@ def finish(
     backend: str,
     twin_backend: str | None = None,
     contents: Optional[Contents] = None,
-    problem: Optional[Problem] = None,
     device="cpu",
 ) -> tuple[ArticulatedObject, list[str], FinishRecord]:
     """The twin, one line for each slot that vanished, and what was measured on the way.
 
     views: photographs by state.  losses: those of the last training phase, for ``tune`` (None: it is left out).  backend: draws the states,
-    twin_backend: the twin in ``tune`` (None: the same).  contents: finds what is in drawers (None: nobody does).  problem: the states'
-    surfaces, which may contradict a refined motion (None: nobody asks them).  A part's confidence
+    twin_backend: the twin in ``tune`` (None: the same).  contents: finds what is in drawers (None: nobody does).  A part's confidence
     is ``JointEvidence.confidence`` of its joint.
     """
     labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
@@ -202,8 +198,6 @@ def finish(
     options = {"backend": backend, "device": device}
     level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
-    if problem is not None:
-        stacks = SurfaceStacks(problem, stacks)
     twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
     labels, moved = settle_labels(twin, views, stacks, config, contents, twin_backend or backend)
     found = [state_labels(learned, labels, s, transforms) for s in states]

@@ -46,22 +46,6 @@ def explain_by_free_space(
     return torch.where(relabel, best.indices, labels), ~wrong | relabel
 
 
-@torch.no_grad()
-def seen_through(means: Tensor, labels: Tensor, transforms: Tensor, stack: DepthStack, tau_static: float, tau_moving: float) -> Tensor:
-    """Which Gaussians of one state hang in front of what the other state's cameras see, once carried there, [N] bool.
-
-    means [N, 3]; labels [N]; transforms [K-1, 4, 4] to the other state; stack: rendered depth of the other state.  tau_moving: tolerance
-    for moved ones, above the error that their motion may still have; what stays needs only tau_static.
-    """
-    out = torch.zeros(len(means), dtype=torch.bool)
-    for k in range(len(transforms) + 1):
-        rows = (labels == k).nonzero().squeeze(1)
-        points = means[rows] if k == 0 else se3.apply(transforms[k - 1].to(means), means[rows])
-        free, on, _ = stack.counts(points, tau_moving if k else tau_static)
-        out[rows] = classify(free, on, need=4, ratio=2.0)[0]
-    return out
-
-
 def landed(means: Tensor, labels: Tensor, transforms: Tensor) -> Tensor:
     """Where Gaussians come to lie in the other state, [N, 3]. means [N, 3]; labels [N]; transforms [K-1, 4, 4] to it."""
     T = with_static(transforms).to(means)[labels]

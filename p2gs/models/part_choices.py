@@ -18,13 +18,14 @@ if TYPE_CHECKING:
 
 
 def simplify(
-    states, motions: PartMotions, views, config: PartMotionsConfig, *, backend: str, device="cpu", log: list[dict] | None = None
-) -> PartMotions:
+    states, motions: PartMotions, views, config: PartMotionsConfig, stacks: list[DepthStack], *, backend: str, device="cpu",
+    log: list[dict] | None = None,
+) -> PartMotions:  # fmt: skip
     """Make one of touching parts with one motion, and drop parts without which the images are explained as well.
 
     log: told of each part that goes: what was done, its type, image loss with and without it, the loss that was allowed.
     """
-    cost = explanation_cost(states, motions, views, config.coarse.levels[-1], backend, device)
+    cost = explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device)
     tried: set[tuple] = set()
     while len(motions):
         found = None
@@ -32,7 +33,7 @@ def simplify(
             if change in tried:
                 continue
             tried.add(change)
-            lower = explanation_cost(states, reduced, views, config.coarse.levels[-1], backend, device)
+            lower = explanation_cost(states, reduced, views, config.coarse, stacks, backend=backend, device=device)
             penalty = config.merge_penalty if change[0] == "merge" else config.part_penalty
             if lower <= cost * (1 + penalty):
                 found = (reduced, lower)
@@ -95,10 +96,9 @@ def settle_types(
     states, motions: PartMotions, views, config: PartMotionsConfig, stacks: list[DepthStack], *, seed: int, backend: str, device="cpu"
 ) -> PartMotions:
     """Fit both joint types where the angle leaves room for doubt, keep the one the images prefer; then refine with the types held."""
-    level = config.coarse.levels[-1]
 
     def cost(m: PartMotions) -> float:
-        return explanation_cost(states, m, views, level, backend, device)
+        return explanation_cost(states, m, views, config.coarse, stacks, backend=backend, device=device)
 
     best = None
     for k in range(len(motions)):

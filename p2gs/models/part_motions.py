@@ -14,7 +14,6 @@ from torch import Tensor
 from p2gs.data.views import TrainingViews
 from p2gs.models.bodies import Surfaces, one_part_a_body
 from p2gs.models.discovery import Discovery, DiscoveryConfig, discover, relabel, surface_energy
-from p2gs.models.discovery.pipeline import SurfaceStacks
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.part_choices import settle_types, simplify
@@ -114,7 +113,7 @@ def find_part_motions(
             raise UserError(f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)")
     say("looking for parts")
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
-    stacks = SurfaceStacks(found.problem)
+    stacks = found.problem.stacks
     explanations, looks = _explanations(found), []
     if len(explanations) > config.candidates:
         say(f"a quick look at {len(explanations)} explanations")
@@ -122,20 +121,20 @@ def find_part_motions(
 
         def first_look(explanation) -> float:
             motions = refine(states, _label_states(explanation, states), views, quick, stacks, **options)
-            return energy(found, motions, explanation_cost(states, motions, views, quick.levels[0], backend, device))
+            return energy(found, motions, explanation_cost(states, motions, views, quick, stacks, backend=backend, device=device))
 
         looks = [first_look(e) for e in explanations]
         order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
         explanations = [explanations[i] for i in order]
-    refined, tried, level = [], [], config.coarse.levels[-1]
+    refined, tried = [], []
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
             say(f"re-rendering explanation {number + 1} of {len(explanations)}")
         motions = refine(states, motions, views, config.coarse, stacks, **options)
         reductions: list[dict] = []
-        motions = simplify(states, motions, views, config, backend=backend, device=device, log=reductions)
-        cost = explanation_cost(states, motions, views, level, backend, device)
+        motions = simplify(states, motions, views, config, stacks, backend=backend, device=device, log=reductions)
+        cost = explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device)
         rank = energy(found, motions, cost)
         tried.append({"types": motions.types, "cost": cost, "rank": rank, "value": explanation.value, "reductions": reductions})
         refined.append((rank, number, motions))
@@ -153,8 +152,8 @@ def find_part_motions(
             say("reconsidering each part" + (f" of explanation {number + 1}" if len(contenders) > 1 else ""))
             motions, reconsidered = reconsider(found, states, motions, views, config, stacks, limit, **options)
             changed += reconsidered
-            motions = simplify(states, motions, views, config, backend=backend, device=device, log=changed)
-        rank = energy(found, motions, explanation_cost(states, motions, views, level, backend, device))
+            motions = simplify(states, motions, views, config, stacks, backend=backend, device=device, log=changed)
+        rank = energy(found, motions, explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device))
         contests.append({"explanation": number, "types": motions.types, "rank": rank})
         ends.append((number, motions, shifted, changed))
     number, motions, shifted, changed = ends[min(range(len(ends)), key=lambda i: contests[i]["rank"])]

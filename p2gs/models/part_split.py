@@ -197,7 +197,7 @@ def ways_disagree(
     """
     told, (a, b) = [], pair
     points = torch.cat([states[0].gaussians.means[motions.labels[0] == k + 1] for k in pair]).double().cpu()
-    for side in sides_of(states, motions, views, config, stacks):
+    for side in sides_of(states, motions, views, config, stacks, backend=backend, device=device):
         T, _ = polish([side], motions.transforms, motions.types, config, seed=seed, backend=backend, device=device)
         told.append((se3.apply(T[b], points) - se3.apply(T[a], points)).mean(0))
     return float((told[0] - told[1]).norm() / (told[0] + told[1]).norm().clamp_min(1e-12))

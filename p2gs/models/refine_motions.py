@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from p2gs.models.agreement import ShownPixels, kept_and_shown
 from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.discovery.pipeline import SurfaceStacks
-from p2gs.models.free_space import seen_through
+from p2gs.models.discovery.fields import Landing
 from p2gs.models.handover import PartMotions
 from p2gs.models.screw_polish import PolishConfig, Side, allowed_step, apply_step, photometric_cost, polish
 from p2gs.ops import se3
 
-# Change of the mean landing cost (0..1) that is none: by so much a plate's true motion may land worse than one 2.7 degrees off
-# (zoo dishwasher_12428_wide); one that photographs pulled 10 degrees off lands 0.055 worse (oven_101943).
-NOISE = 0.04
+# What a pixel costs that the other state hides: as much of the loss of one without any likeness (1 of 1 - SSIM, weighted 0.8) as landing in
+# hidden space costs of landing in free space.
+HIDDEN = 0.8 * Landing.HIDDEN
 
 
 def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor:
@@ -24,20 +24,20 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
     return torch.where(motions.margin[state] >= min_margin, motions.labels[state], -1)
 
 
-def sides_of(states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack]) -> list[Side]:
-    """Both directions: the start's Gaussians against the end's photographs, and the reverse.
+def sides_of(
+    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], *, backend: str, device="cpu"
+) -> list[Side]:
+    """Both directions: the start's Gaussians against the end's photographs, and the reverse, of each what both states show.
 
-    stacks: rendered depth of both states. What the other state sees through is left out: no motion can make it fit.
+    stacks: rendered depth of both states.
     """
+    seen = what_counts(states, motions, config, stacks, shown_alone=True, backend=backend, device=device)
     sides = []
     for s in (0, 1):
-        g, labels = states[s].gaussians, polish_labels(motions, s, config.min_margin)
-        if config.free_static > 0 and config.free_moving > 0:
-            T = se3.inverse(motions.transforms) if s else motions.transforms
-            through = seen_through(g.means, motions.labels[s], T, stacks[1 - s], config.free_static, config.free_moving)
-            labels = torch.where(through, -1, labels)
+        g = states[s].gaussians
+        labels = torch.where(seen[s].kept, polish_labels(motions, s, config.min_margin), -1)
         seen_from = stacks[s].seen_from(g.means.detach().cpu(), config.free_static or 0.02) if config.front > -1 else None
-        sides.append(Side(g, labels, views[1 - s], s == 1, seen_from))
+        sides.append(Side(g, labels, views[1 - s], s == 1, seen_from, seen[1 - s].pixels))
     return sides
 
 
@@ -47,23 +47,9 @@ def refine(
     """Photometric refinement of all motions, both directions at once."""
     if config.steps <= 0 or len(motions) == 0:
         return motions
-    sides = sides_of(states, motions, views, config, stacks)
+    sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
     result, _ = polish(sides, motions.transforms, motions.types, config, seed=seed, backend=backend, device=device)
-    if isinstance(stacks, SurfaceStacks):
-        result = uncontradicted(states, motions, result, stacks)
     return replace(motions, transforms=result)
-
-
-def uncontradicted(states, motions: PartMotions, refined: Tensor, surfaces: SurfaceStacks) -> Tensor:
-    """The refined motions [K-1, 4, 4], but of plates of which the states show different sides (to know the other side explains more than
-    ``NOISE``) what they were where the surface arrives worse now: photographs pull such a plate to where neither state has it."""
-    labels = surfaces.surfel_labels([s.gaussians.means.detach().cpu() for s in states], motions.labels)
-    out = refined.clone()
-    for k in range(len(motions)):
-        (before, other_side), (after, _) = (surfaces.arrival(labels, T, motions.types, k) for T in (motions.transforms, refined))
-        if other_side > NOISE and after > before + NOISE:
-            out[k] = motions.transforms[k]
-    return out
 
 
 def single_ways(
@@ -76,24 +62,55 @@ def single_ways(
     if config.steps <= 0 or len(motions) == 0:
         return {}
     short = replace(config, steps=max(config.steps // 3, 1), rate=config.rate / 2)
-    sides = sides_of(states, motions, views, config, stacks)
+    sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
     found = [polish([side], motions.transforms, motions.types, short, seed=seed, backend=backend, device=device) for side in sides]
     return {name: T for name, (T, _) in zip(("forward", "backward"), found, strict=True)}
 
 
-def explanation_cost(states, motions: PartMotions, views, level: int, backend: str, device="cpu") -> float:
-    """Image loss of each state's Gaussians moved into the other state's photographs, both directions averaged."""
-    there = photometric_cost(
-        states[0].gaussians, motions.labels[0], motions.transforms, views[1], level=level, backend=backend, device=device
-    )
-    back = photometric_cost(
-        states[1].gaussians, motions.labels[1], se3.inverse(motions.transforms), views[0], level=level, backend=backend, device=device
-    )
-    return 0.5 * (there + back)
+def explanation_cost(
+    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], *, backend: str, level: int | None = None,
+    seen: list[Seen] | None = None, device="cpu",
+) -> float:  # fmt: skip
+    """Image loss of each state's Gaussians moved into the other state's photographs, both directions averaged.
+
+    Of the Gaussians those that nothing contradicts are drawn (``kept_and_shown``); pixels of surface that the other state hides cost ``HIDDEN``
+    instead of what is wrong in them, which no motion could mend.  level: size of the photographs (None: ``config``'s last).  seen: what is
+    drawn and what counts, of ``what_counts`` (None: found for these motions).
+    """
+    seen = what_counts(states, motions, config, stacks, backend=backend, device=device) if seen is None else seen
+    ways, level, total = (motions.transforms, se3.inverse(motions.transforms)), config.levels[-1] if level is None else level, 0.0
+    for s in (0, 1):
+        labels, options = torch.where(seen[s].kept, motions.labels[s], -1), {"backend": backend, "device": device}
+        there = {"level": level, "shown": seen[1 - s].pixels, "hidden": HIDDEN}
+        total += photometric_cost(states[s].gaussians, labels, ways[s], views[1 - s], **there, **options)
+    return 0.5 * total
+
+
+@dataclass
+class Seen:
+    """Of a state: which Gaussians [N] nothing contradicts in the other state; the weight of its photographs' pixels (None: all count alike)."""
+
+    kept: Tensor
+    pixels: ShownPixels | None
+
+
+def what_counts(
+    states, motions: PartMotions, config: PolishConfig, stacks: list[DepthStack], *, backend: str, shown_alone: bool = False, device="cpu"
+) -> list[Seen]:
+    """Of both states, under these motions. Pixels count as far as they are not of surface that the other state hides, or (shown_alone) as far
+    as the other state shows what is in them; everything does where a tolerance of ``config`` is 0."""
+    out = []
+    for s in (0, 1):
+        if config.free_static <= 0 or config.free_moving <= 0:
+            out.append(Seen(torch.ones(len(motions.labels[s]), dtype=torch.bool), None))
+            continue
+        kept, shown = kept_and_shown(states, motions, s, stacks, config)
+        out.append(Seen(kept, ShownPixels(states[s], shown if shown_alone else shown | ~kept, backend, device)))
+    return out
 
 
 def survey(
-    states, motions: PartMotions, views, level: int, reach: list[float], *, backend: str, device="cpu"
+    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], reach: list[float], *, backend: str, device="cpu"
 ) -> tuple[PartMotions, list[int]]:
     """Lay each part, shifted within its own surface, where the images are explained best; the refinement goes on from there.
 
@@ -101,7 +118,9 @@ def survey(
     descent leaves. reach: shifts tried to both sides of the part's two long directions (internal units).  Returns the motions
     and which of them moved.
     """
-    best = explanation_cost(states, motions, views, level, backend, device)
+    seen = what_counts(states, motions, config, stacks, backend=backend, device=device)
+    options = {"level": config.levels[0], "seen": seen, "backend": backend, "device": device}
+    best = explanation_cost(states, motions, views, config, stacks, **options)
     moved = []
     for k in range(len(motions)):
         points = states[0].gaussians.means[motions.labels[0] == k + 1].double().cpu()
@@ -120,7 +139,7 @@ def survey(
                 T = apply_step(motions.transforms[k], centre, radius, step)
                 T = se3.project_revolute(T) if motions.types[k] == "revolute" else T
                 tried = motions.with_motion(k, motions.types[k], T)
-                cost = explanation_cost(states, tried, views, level, backend, device)
+                cost = explanation_cost(states, tried, views, config, stacks, **options)
                 if cost < best:
                     best, found = cost, tried
         if found is not None:
@@ -147,10 +166,9 @@ def leave_false_minima(
     """
     if config.steps <= 0 or not reach or len(motions) == 0:
         return motions, []
-    level = config.levels[0]
-    surveyed, moved = survey(states, motions, views, level, reach, backend=backend, device=device)
+    surveyed, moved = survey(states, motions, views, config, stacks, reach, backend=backend, device=device)
     if not moved:
         return motions, []
     surveyed = refine(states, surveyed, views, config, stacks, seed=seed, backend=backend, device=device)
-    before, after = (explanation_cost(states, m, views, config.levels[-1], backend, device) for m in (motions, surveyed))
+    before, after = (explanation_cost(states, m, views, config, stacks, backend=backend, device=device) for m in (motions, surveyed))
     return (surveyed, moved) if after < before else (motions, [])

@@ -7,9 +7,9 @@ images give the motion to a few hundredths of a degree.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Callable
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
@@ -29,12 +29,10 @@ class PolishConfig:
     steps: per direction (0 = off).  levels, level_starts: image sizes over the steps.  rate: step size at the start in internal
     units of displacement at the part's rim; falls to a hundredth.  ssim_lambda: weight of SSIM against L1; high, because shading
     differs between states while structure does not.  min_margin: Gaussians whose label is less clear than this (internal units)
-    are left out.  free_static, free_moving: so are those which the other state's cameras see through by more than this, of the base and
-    of moving parts (internal units; 0 = kept).  front: a view has no say on a surface that its own state's cameras saw from directions
-    whose cosine with the view's is below this (-1: all views have).  rim: in and around a turning part a pixel counts as much as the
-    part covers it, to this power, but rim_least at least (rim 0: all pixels count alike). A turn lays bare faces beside the rim which
-    the other state never saw; what does see the rim pulls it over them. Of a plain part the rim is all there is to see: so it counts
-    less, not nothing. A slide shows the same faces in both states.
+    are left out.  free_static, free_moving: tolerances (internal units) for what of the base and of moving parts lies
+    on a surface of the other state; other_colour: mean difference of channels (0..1) by which it is another's surface. Only what both
+    states show has a say (``models/agreement.py``; free_static or free_moving 0: all has).  front: a view has no say on a surface that its
+    own state's cameras saw from directions whose cosine with the view's is below this (-1: all views have).
     """
 
     steps: int = 200
@@ -46,9 +44,8 @@ class PolishConfig:
     min_opacity: float = 0.05
     free_static: float = 0.02
     free_moving: float = 0.05
+    other_colour: float = 0.2
     front: float = 0.2
-    rim: float = 0.0
-    rim_least: float = 0.5
 
     def level(self, fraction: float) -> int:
         """Image size when this share of the steps is done."""
@@ -124,20 +121,13 @@ def apply_step(T: Tensor, centre: Tensor, radius: Tensor | float, step: Tensor) 
     return se3.make(R, centre - (R @ centre[..., None])[..., 0] + step[..., 3:]) @ T
 
 
-def say_of_pixels(turning: Tensor, power: float, least: float = 0.0, reach: int = 3) -> Tensor:
-    """Weight of each pixel [H, W]: within ``reach`` pixels of a turning part between ``least`` and 1, by ``turning`` (what such parts,
-    moved, cover, 0..1) to ``power``; 1 elsewhere.
-    """
-    near = F.max_pool2d((turning > 0.02).float()[None, None], 2 * reach + 1, 1, reach)[0, 0] > 0.5
-    return torch.where(near, least + (1 - least) * turning.clamp(0, 1) ** power, 1.0)
-
-
 @dataclass
 class Side:
     """Frozen Gaussians of one state, labels [N] (part of each, -1 leaves it out) and the other state's photographs.
 
     back: they are the end state's, carried to the start.  seen_from: mean direction [N, 3] to the cameras of their own state that see
-    each (``DepthStack.seen_from``); None: all views count.
+    each (``DepthStack.seen_from``); None: all views count.  shown: weight [H, W] of the pixels of a photograph, asked with its number, size
+    and camera (``ShownPixels``); None: all count alike.
     """
 
     gaussians: GaussianTensors
@@ -145,6 +135,7 @@ class Side:
     views: TrainingViews
     back: bool = False
     seen_from: Tensor | None = None
+    shown: Callable[[int, int, Camera], Tensor] | None = None
 
 
 def polish(
@@ -176,8 +167,6 @@ def polish(
         fronts.append(None if side.seen_from is None else side.seen_from[labels >= 0].to(device))
     enough = [torch.bincount(body.labels, minlength=len(types) + 1)[1:].cpu() >= 10 for body in bodies]
     slides = torch.tensor([kind == "prismatic" for kind in types])
-    turns = torch.cat([torch.zeros(1), (~slides).float()]).to(device)
-    turning = [turns[body.labels][:, None] if config.rim > 0 and not slides.all() else None for body in bodies]
     anchors, radius = _anchors(sides, bodies, transforms)
     first, second = torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
     taken = torch.zeros(len(transforms), 1)
@@ -189,15 +178,16 @@ def polish(
         generator = torch.Generator().manual_seed((seed + side.back) * 1_000_003 + number)
         background = torch.rand(3, generator=generator)
         index = view_index(seed + side.back + 13, number, len(side.views))
-        shot = side.views.get(index, side.views.levels.index(config.level(fraction)), background)
+        size = side.views.levels.index(config.level(fraction))
+        shot = side.views.get(index, size, background)
         means, quats, sh = body.moved(se3.inverse(transforms) if side.back else transforms)
         means.requires_grad_(True)
         quats.requires_grad_(True)
-        out = body.render(means, quats, sh, shot.camera, background, backend, turning[turn])
+        out = body.render(means, quats, sh, shot.camera, background, backend)
         target = shot.image.to(out.colour.device)
         colour = out.colour
-        if turning[turn] is not None:
-            colour = target + say_of_pixels(out.features.detach()[..., 0], config.rim, config.rim_least)[..., None] * (colour - target)
+        if side.shown is not None:
+            colour = target + side.shown(index, size, shot.camera)[..., None] * (colour - target)
         loss = l1_ssim(colour, target, config.ssim_lambda)
         loss.backward()
         if fraction >= 0.9:
@@ -252,16 +242,26 @@ def photometric_cost(
     level: int,
     count: int = 16,
     ssim_lambda: float = 0.8,
+    shown: Callable[[int, int, Camera], Tensor] | None = None,
+    hidden: float = 0.0,
     backend: str = "auto",
     device: torch.device | str = "cpu",
 ) -> float:
-    """Mean image loss of the moved Gaussians over ``count`` views spread over the training set: lower explains the images better."""
+    """Mean image loss of the moved Gaussians over ``count`` views spread over the training set: lower explains the images better.
+
+    shown: weight of each pixel, as in ``Side``; what a pixel lacks of 1 costs ``hidden`` instead (None: all count alike).
+    """
     body = MovedGaussians(gaussians, labels, device)
     means, quats, sh = body.moved(transforms)
     total, picked = 0.0, views.spread(count)
     for index in picked:
         background = torch.full((3,), 0.5)
-        shot = views.get(index, views.levels.index(level), background)
-        out = body.render(means, quats, sh, shot.camera, background, backend)
-        total += float(l1_ssim(out.colour, shot.image.to(out.colour.device), ssim_lambda))
+        size = views.levels.index(level)
+        shot = views.get(index, size, background)
+        colour, target = body.render(means, quats, sh, shot.camera, background, backend).colour, shot.image.to(body.device)
+        if shown is not None:
+            weight = shown(index, size, shot.camera)
+            colour = target + weight[..., None] * (colour - target)
+            total += hidden * float(1 - weight.mean())
+        total += float(l1_ssim(colour, target, ssim_lambda))
     return total / len(picked)

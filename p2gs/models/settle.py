@@ -63,7 +63,7 @@ def reconsider(
     level, log = config.coarse.levels[-1], []
 
     def cost_of(m: PartMotions) -> float:
-        return explanation_cost(states, m, views, level, **options)
+        return explanation_cost(states, m, views, config.coarse, stacks, **options)
 
     cost = cost_of(motions)
     for _ in range(limit if len(motions) else 0):
@@ -156,8 +156,8 @@ def settle_labels(
     For ``rounds`` rounds, while the images are explained better. Returns the motions and what each round measured.
     """
     options = {"seed": seed, "backend": backend, "device": device}
-    level, rounds = config.coarse.levels[-1], []
-    cost = explanation_cost(states, motions, views, level, backend, device)
+    rounds: list[dict] = []
+    cost = explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device)
     for number in range(config.rounds if len(motions) else 0):
         best = None
         # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from here on
@@ -165,7 +165,7 @@ def settle_labels(
             tried = _relabelled(found, states, motions) if name == "anew" else motions
             labels, count = settle_islands([s.gaussians for s in states], tried.labels, tried.transforms, config.islands)
             tried = refine(states, replace(tried, labels=labels), views, config.coarse, stacks, **options)
-            reached = explanation_cost(states, tried, views, level, backend, device)
+            reached = explanation_cost(states, tried, views, config.coarse, stacks, backend=backend, device=device)
             rounds.append({"round": number, "labels": name, "islands": count, "before": cost, "after": reached})
             if best is None or reached < best[0]:
                 best = (reached, tried)
@@ -174,7 +174,7 @@ def settle_labels(
         motions = settle_types(states, best[1], views, config, stacks, **options)
         if best[0] > cost * (1 - SETTLED):
             break
-        cost = explanation_cost(states, motions, views, level, backend, device)
+        cost = explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device)
     return motions, rounds
 
 

@@ -18,6 +18,7 @@ from p2gs.models.finish import (
     surviving_slots,
 )
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
+from p2gs.models.joint_confidence import state_depth
 from p2gs.models.part_choices import simplify, without_part
 from p2gs.models.part_motions import PartMotionsConfig
 from p2gs.models.screw_polish import MovedGaussians, PolishConfig
@@ -86,11 +87,12 @@ def test_one_part_cut_in_two_becomes_one_and_a_true_part_stays():
     near = se3.from_screw(torch.tensor([0.0, 0.1, 1]).double(), torch.tensor([0.4, 0.5, 0]).double(), 0.51)
     motions = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [cut, cut], [torch.ones(len(cut))] * 2)
     config = PartMotionsConfig(coarse=PolishConfig(levels=[64], level_starts=[0.0]))
-    simple = simplify(states, motions, views, config, backend="auto")
+    stacks = [state_depth(s, views[s.state], 64) for s in states]
+    simple = simplify(states, motions, views, config, stacks, backend="auto")
     assert len(simple) == 1 and torch.equal(simple.labels[0], labels)
     # the start hides one of the pieces: that they touch shows in the end
     half = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [labels, cut], [torch.ones(len(cut))] * 2)
-    simple = simplify(states, half, views, config, backend="auto")
+    simple = simplify(states, half, views, config, stacks, backend="auto")
     assert len(simple) == 1 and torch.equal(simple.labels[1], labels)
 
 

@@ -114,13 +114,12 @@ def test_survey_leaves_a_false_minimum(kind, truth):
     off[:3, 3] += 0.12 * long / long.norm()
     margins = [torch.ones(len(labels))] * 2
     motions = PartMotions([kind], off[None], torch.ones(1), [labels, labels], margins)
-    assert survey(states, motions, views, 64, [], backend="auto")[1] == []
-    moved, which = survey(states, motions, views, 64, [0.06, 0.12], backend="auto")
+    config = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0)
+    stacks = [None, None]  # not looked at: nothing is left out, all views count
+    assert survey(states, motions, views, config, stacks, [], backend="auto")[1] == []
+    moved, which = survey(states, motions, views, config, stacks, [0.06, 0.12], backend="auto")
     error = [float((T[:3, 3] - truth[:3, 3]).norm()) for T in (off, moved.transforms[0])]
     assert which == [0] and error[1] < 0.5 * error[0]
-    config = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0)
-    stacks = [None, None]  # not looked at: nothing is left out, all views count
-    config.front = -1.0
     better, which = leave_false_minima(states, motions, views, config, stacks, [0.06, 0.12], seed=0, backend="auto")
     assert which == [0] and float((better.transforms[0, :3, 3] - truth[:3, 3]).norm()) < 0.02
     assert leave_false_minima(states, motions, views, config, stacks, [], seed=0, backend="auto") == (motions, [])

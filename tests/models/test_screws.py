@@ -7,9 +7,8 @@ from tiny import hinge, photographs, slide, textured_panels
 from p2gs.data.views import TrainingViews
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.part_pull import tangent_gradient
-from p2gs.models.screw_polish import PolishConfig, Side, allowed_step, apply_step, polish, say_of_pixels
+from p2gs.models.screw_polish import PolishConfig, Side, allowed_step, apply_step, polish
 from p2gs.ops import se3, so3
-from p2gs.types import GaussianTensors
 
 
 def test_tangent_gradient_is_the_derivative():
@@ -87,31 +86,3 @@ def test_polish_recovers_a_known_motion(kind, ways):
     at = [(T[:3, :3] @ centre + T[:3, 3]) for T in (found[0], truth)]
     assert float((at[0] - at[1]).norm()) < 0.003
     assert max(losses) < 0.05
-
-
-def test_pixels_count_as_much_as_turning_parts_cover_them():
-    covered = torch.zeros(20, 20)
-    covered[8:12, 8:12], covered[8:12, 12] = 1.0, 0.5
-    say = say_of_pixels(covered, 2.0)
-    assert torch.equal(say[8:12, 8:12], torch.ones(4, 4)) and torch.equal(say[8:12, 12], torch.full((4,), 0.25))
-    assert not say[5:8, 8:12].any() and not say[8:12, 13:16].any()  # around it nothing counts
-    assert torch.equal(say_of_pixels(covered, 2.0, 0.5), torch.maximum(0.5 + 0.5 * say, torch.tensor(0.5)))
-    assert torch.equal(say[:5], torch.ones(5, 20)) and torch.equal(say[:, 16:], torch.ones(20, 4))  # far from it all do
-
-
-def test_a_face_that_the_other_state_never_saw_pulls_a_turn_less_with_rim():
-    """In the end's photographs the panel goes on beyond what the start's Gaussians have of it."""
-    g, labels = textured_panels()
-    truth = hinge()
-    beyond = (labels == 1) & (g.means[:, 0] < -0.25)
-    more = g[beyond].clone()
-    more.means = more.means - torch.tensor([0.15, 0.0, 0.0])
-    whole = GaussianTensors.cat([g, more])
-    photos = photographs(whole, torch.cat([labels, labels[beyond]]), truth, 1)
-    side = Side(g, labels, TrainingViews(photos, [64]))
-    centre, off = g.means[labels == 1].double().mean(0), {}
-    for rim in (0.0, 2.0):
-        config = PolishConfig(steps=120, levels=[64], level_starts=[0.0], rate=1e-2, rim=rim, rim_least=0.0)
-        found, _ = polish([side], truth[None], ["revolute"], config, seed=0)
-        off[rim] = float((se3.apply(found[0], centre[None]) - se3.apply(truth, centre[None])).norm())
-    assert off[2.0] < 0.5 * off[0.0] and off[0.0] > 2e-3, off

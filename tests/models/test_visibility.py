@@ -4,8 +4,6 @@ import pytest
 import torch
 from tiny import look_at
 
-from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.free_space import seen_through
 from p2gs.models.visibility import footprint, visible_share
 from p2gs.render import rasterize
 from p2gs.render.base import PIXELS
@@ -44,17 +42,3 @@ def test_what_a_shell_encloses_is_hidden_and_the_shell_is_not():
     assert float((share[:6000] > 0.1).float().mean()) > 0.3  # overlaps hide much, and the ring of cameras does not see the south
     lone = visible_share(g[torch.tensor([6000])], ring())
     assert float(lone) == pytest.approx(1.0, abs=0.05)
-
-
-def test_seen_through_by_label_and_tolerance():
-    camera = look_at(torch.tensor([3.0, 0.0, 0.0]), 32)
-    cameras = [camera] * 5
-    flat = torch.full((32, 32), 3.0)  # the other state's surface: the plane through the origin
-    stack = DepthStack([flat] * 5, [torch.ones(32, 32)] * 5, cameras)
-    points = torch.tensor([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.0, 0.0], [-0.3, 0.0, 0.0]])
-    labels = torch.tensor([0, 0, 0, 1, 0])
-    away = torch.eye(4, dtype=torch.float64)
-    away[0, 3] = -0.16  # carries the moving one to 0.04 in front
-    found = seen_through(points, labels, away[None], stack, 0.02, 0.05)
-    assert found.tolist() == [False, True, True, False, False]
-    assert seen_through(points, labels, away[None], stack, 0.02, 0.03).tolist() == [False, True, True, True, False]

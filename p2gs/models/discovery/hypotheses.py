@@ -12,7 +12,6 @@ from p2gs.models.discovery.fields import Landing, normal_code
 from p2gs.models.discovery.problem import Problem
 from p2gs.models.discovery.rigid import Motions, perpendicular
 
-
 PLATE = 0.5  # thickness of plates in the sweep, coarse voxels: surfaces within three quarters of one count as met
 OTHER_SIDE = 0.8  # evidence of a plate's other side beside that of the same surface: its colours confirm nothing
 

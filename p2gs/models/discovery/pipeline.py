@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from p2gs.models.discovery.config import DiscoveryConfig
-from p2gs.models.discovery.evidence import DepthStack, StateEvidence
+from p2gs.models.discovery.evidence import StateEvidence
 from p2gs.models.discovery.finish import Explanation, settle_parts, split_amounts, with_amounts
 from p2gs.models.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.models.discovery.labels import Graph, Labelling, label
@@ -120,36 +120,6 @@ def surface_energy(found: Discovery, transforms: Tensor, types: list[str]) -> fl
     motions = sided(found.problem, as_motions(transforms, types))
     labelling = label(found.problem, motions, found.graphs)
     return judged(found.search, Explanation(motions, labelling, 0.0, total_score(found.problem, motions, labelling))).score
-
-
-class SurfaceStacks(list):
-    """Rendered depth of both states (a list of two ``DepthStack``: the problem's or, where given, others) and the surfaces that were found in
-    it, which judge refined motions."""
-
-    def __init__(self, problem: Problem, stacks: list[DepthStack] | None = None):
-        super().__init__(problem.stacks if stacks is None else stacks)
-        self.problem = problem
-
-    def arrival(self, labels: list[Tensor], transforms: Tensor, types: list[str], part: int) -> tuple[float, float]:
-        """Mean landing cost (0..1, both states alike) of a part's surfels under its motion, the thickness of plate chosen to suit it; and how
-        much of it knowing the plate's other side saves.
-
-        labels: part of each surfel of both states (0 static).  transforms [K, 4, 4].
-        """
-        plain = as_motions(transforms[part : part + 1], types[part : part + 1])
-        both = Motions.cat([sided(self.problem, plain), plain])
-        costs = []
-        for s in (0, 1):
-            index = (labels[s] == part + 1).nonzero().squeeze(1)
-            if len(index):
-                costs.append(self.problem.cost(both, s, index)[0].mean(1))
-        cost, one_sided = (sum(costs) / len(costs)).tolist() if costs else (0.0, 0.0)
-        return cost, one_sided - cost
-
-    def surfel_labels(self, gaussians: list[Tensor], labels: list[Tensor]) -> list[Tensor]:
-        """Label of the Gaussian (means [N, 3], labels [N], by state) next to each surfel."""
-        pairs = zip(gaussians, labels, self.problem.surfels, strict=True)
-        return [lab[torch.from_numpy(cKDTree(means.numpy()).query(s.points.numpy())[1])] for means, lab, s in pairs]
 
 
 def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int | None, count: int = 2) -> list[tuple[Tensor, str]]:
