@@ -36,6 +36,12 @@ def to_input(T: torch.Tensor, similarity) -> torch.Tensor:
     return se3.make(T[:3, :3], T[:3, 3] / similarity.scale + c - T[:3, :3] @ c)
 
 
+def to_training(T: torch.Tensor, similarity) -> torch.Tensor:
+    """A motion [4, 4] of the input's world in training units: what ``to_input`` takes back."""
+    c = torch.as_tensor(similarity.center, dtype=torch.float64)
+    return se3.make(T[:3, :3], (T[:3, :3] @ c + T[:3, 3] - c) * similarity.scale)
+
+
 def joint_of(T: torch.Tensor, kind: str) -> SimpleNamespace:
     """A transform [4, 4] as the joint that ``evaluate_joints`` reads."""
     if kind == "prismatic":

@@ -48,6 +48,17 @@ def simplify(
     return motions
 
 
+def join_twins(states, motions: PartMotions, reach: float) -> tuple[PartMotions, list[dict]]:
+    """One part for every two that touch and whose motions carry the smaller one's points to within ``reach`` (internal units) of each other:
+    nothing tells them from one body.  Returns the motions and the types of those that went, with the parts that they joined."""
+    log: list[dict] = []
+    while (pair := next((c for c in _reductions(states, motions, reach) if c[0][0] == "merge"), None)) is not None:
+        (_, small, large), reduced = pair
+        log.append({"type": motions.types[small], "into": large})
+        motions = reduced
+    return motions, log
+
+
 def _reductions(states, motions: PartMotions, same_motion: float):
     """Explanations with one part less: (what changed, motions). Merging comes first, small parts go before large ones."""
     solid = [torch.sigmoid(s.gaussians.opacity_logits) > 0.5 for s in states]

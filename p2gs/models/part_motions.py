@@ -5,7 +5,6 @@ Not a training phase of the paper: its ancestors need hand-made part centres or 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -13,12 +12,12 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews
 from p2gs.models.bodies import Surfaces, one_part_a_body
-from p2gs.models.discovery import Discovery, DiscoveryConfig, discover, relabel, surface_energy
+from p2gs.models.discovery import Discovery, DiscoveryConfig, discover, relabel
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.part_choices import settle_types, simplify
+from p2gs.models.part_choices import join_twins, settle_types, simplify
 from p2gs.models.phase import PHASES
-from p2gs.models.refine_motions import explanation_cost, leave_false_minima, refine
+from p2gs.models.refine_motions import energy, explanation_cost, leave_false_minima, refine
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.models.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
 from p2gs.ops import se3
@@ -35,17 +34,18 @@ class PartMotionsConfig:
     and their energy is within ``contend`` of the best: a wrong start may lead nowhere, and a worse one to the truth.
     coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
-    freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: the same for a further part.
+    freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: relative image
+    loss that a part must save once its motion is refined.
     same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one
     unless the image loss rises by more than this share.
     survey: shifts within its own surface tried for each part (internal units; [] = none).
     islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
     (0 = off).  rounds: how often labels, types and motions are settled anew.
-    reconsider: each part's motion, and one more, is searched again amid the others, refined; missing_penalty: relative image loss by
-    which a part that comes so must win; missing_confidence, missing_evidence: confidence and evidence that it must have.
+    reconsider: each part's motion, and one more, is searched again amid the others, refined; where the energy falls;
+    missing_confidence, missing_evidence: confidence and evidence that a further part must have.
     split_reach: a part is tried as two whose motions differ by up to twice this (internal units; 0 = never) where that saves ``split``
     of its residual; also with a part left out whose evidence is below ``doubtful``. Where it saves ``split_fine``, amounts near each other
-    are tried, too: two parts whose motions hardly differ. They must win by split_penalty only, but both directions must tell their
+    are tried, too: two parts whose motions hardly differ. Of these both directions must tell their
     difference alike (``ways_disagree`` below split_ways).
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
@@ -65,13 +65,11 @@ class PartMotionsConfig:
     islands: float = 0.25
     rounds: int = 2
     reconsider: bool = True
-    missing_penalty: float = 0.02
     missing_confidence: float = 0.3
     missing_evidence: float = 0.005
     split_reach: float = 0.05
     split: float = 0.12
     split_fine: float = 0.03
-    split_penalty: float = 0.01
     split_ways: float = 0.27
     doubtful: float = 0.1
     min_confidence: float = 0.02
@@ -159,6 +157,9 @@ def find_part_motions(
     number, motions, shifted, changed = ends[min(range(len(ends)), key=lambda i: contests[i]["rank"])]
     say("settling labels and motions")
     motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
+    motions, joined = join_twins(states, motions, found.problem.scale.tp)
+    if joined:
+        motions = refine(states, motions, views, config.coarse, stacks, **options)
     motions, unfounded = drop_unfounded(found, states, motions, views, config, stacks, **options)
     for part in unfounded:
         say(f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})")
@@ -172,6 +173,7 @@ def find_part_motions(
         "shifted": shifted,
         "reconsidered": changed,
         "rounds": rounds,
+        "joined": joined,
         "unfounded": unfounded,
         **_plain(found.diagnostics),
     }
@@ -183,12 +185,6 @@ def labelled_surfaces(found: Discovery, transforms: Tensor, types: list[str]) ->
     explanation, problem = relabel(found, transforms, types), found.problem
     points, labels = [s.points for s in problem.surfels], [p.argmax(1) for p in explanation.probability]
     return Surfaces(points, labels, problem.scale.spacing, problem.stacks, problem.scale.tau)
-
-
-def energy(found: Discovery, motions: PartMotions, loss: float) -> float:
-    """One number by which explanations are compared, lower is better: the logarithm of the image loss (``explanation_cost``) plus what the
-    surfaces say (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained."""
-    return math.log(max(loss, 1e-9)) + surface_energy(found, motions.transforms, motions.types)
 
 
 def _contenders(refined: list[tuple[float, int, PartMotions]], config: PartMotionsConfig) -> list[tuple[float, int, PartMotions]]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from p2gs.models.agreement import ShownPixels, kept_and_shown
+from p2gs.models.discovery import Discovery, surface_energy
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.discovery.fields import Landing
 from p2gs.models.handover import PartMotions
@@ -84,6 +86,12 @@ def explanation_cost(
         there = {"level": level, "shown": seen[1 - s].pixels, "hidden": HIDDEN}
         total += photometric_cost(states[s].gaussians, labels, ways[s], views[1 - s], **there, **options)
     return 0.5 * total
+
+
+def energy(found: Discovery, motions: PartMotions, loss: float) -> float:
+    """One number by which explanations are compared, lower is better: the logarithm of the image loss (``explanation_cost``) plus what the
+    surfaces say (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained."""
+    return math.log(max(loss, 1e-9)) + surface_energy(found, motions.transforms, motions.types)
 
 
 @dataclass

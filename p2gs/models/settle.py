@@ -15,7 +15,7 @@ from p2gs.models.islands import settle_islands
 from p2gs.models.joint_confidence import JointEvidence, common_level, measure_joints
 from p2gs.models.part_choices import settle_types, without_part
 from p2gs.models.part_split import FINE, splits, ways_disagree
-from p2gs.models.refine_motions import explanation_cost, refine
+from p2gs.models.refine_motions import energy, explanation_cost, refine
 from p2gs.ops.sh import dc_to_rgb
 
 if TYPE_CHECKING:
@@ -53,9 +53,9 @@ def reconsider(
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``); with each every surfel chooses its
     part anew and the states are re-rendered. A part may also be two of nearly one motion (``splits``), as it is or with a doubtful part
     left out: what moved by another amount than its neighbour is easily explained by a wild motion. Two whose motions hardly differ save
-    little, and so do errors of one state: they are held to less, but both directions must tell the difference alike. The best of each
-    kind is refined; the image loss must fall by ``freedom_penalty`` for an exchange and by ``missing_penalty`` for a further part. Junk
-    lowers the loss by as much as a small door does: with labels chosen anew, a further part's surface must also be found in both states
+    little, and so do errors of one state: both directions must tell the difference alike. The best of each
+    kind is refined; the energy must fall. Junk
+    lowers it by as much as a small door does: with labels chosen anew, a further part's surface must also be found in both states
     (discovery's confidence at least ``missing_confidence``) and the photographs must hold its joint where it is
     (``JointEvidence.confidence`` at least ``missing_evidence``).  Returns the motions and what was tried.
     """
@@ -66,6 +66,7 @@ def reconsider(
         return explanation_cost(states, m, views, config.coarse, stacks, **options)
 
     cost = cost_of(motions)
+    lowest = energy(found, motions, cost)
     for _ in range(limit if len(motions) else 0):
         tries = {"exchanged": [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]}
         tries["exchanged for a split"] = _split_without(found, states, motions, views, config, stacks, options)
@@ -90,27 +91,27 @@ def reconsider(
             if "split" in change:  # where the halves meet, geometry may know better once their motions are known
                 anew = refine(states, _relabelled(found, states, refined), views, config.coarse, stacks, seed=seed, **options)
                 reached, refined = min((reached, refined), (cost_of(anew), anew), key=lambda t: t[0])
-            entry["after"] = reached
-            penalty = config.missing_penalty if further else config.freedom_penalty
-            if change == "finely split" and 1 - reached / cost > config.split_penalty:
+            value = energy(found, refined, reached)
+            entry |= {"after": reached, "energy": value - lowest}
+            if value >= lowest:
+                continue
+            if change == "finely split":
                 pair = (part, len(motions))
                 entry["ways"] = ways_disagree(states, refined, pair, views, config.coarse, stacks, seed=seed, **options)
                 if entry["ways"] >= config.split_ways:
                     continue
-                penalty = config.split_penalty
-            rank = reached / (1 - penalty)
-            if further and rank < cost:
+            if further:
                 own = _relabelled(found, states, refined)
                 evidence = _evidence(states, own, views, stacks, options)
                 new = {part, len(motions)}
                 entry |= {"confidence": min(float(own.confidence[k]) for k in new), "evidence": min(evidence[k].confidence for k in new)}
                 if entry["confidence"] < config.missing_confidence or entry["evidence"] < config.missing_evidence:
                     continue
-            if rank < cost and (best is None or rank < best[0]):
-                best = (rank, reached, refined)
+            if best is None or value < best[0]:
+                best = (value, reached, refined)
         if best is None:
             break
-        _, cost, motions = best
+        lowest, cost, motions = best
     return motions, log
 
 

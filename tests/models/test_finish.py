@@ -19,7 +19,7 @@ from p2gs.models.finish import (
 )
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.joint_confidence import state_depth
-from p2gs.models.part_choices import simplify, without_part
+from p2gs.models.part_choices import join_twins, simplify, without_part
 from p2gs.models.part_motions import PartMotionsConfig
 from p2gs.models.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3
@@ -94,6 +94,23 @@ def test_one_part_cut_in_two_becomes_one_and_a_true_part_stays():
     half = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [labels, cut], [torch.ones(len(cut))] * 2)
     simple = simplify(states, half, views, config, stacks, backend="auto")
     assert len(simple) == 1 and torch.equal(simple.labels[1], labels)
+
+
+def test_touching_parts_of_one_motion_are_joined_and_others_stay():
+    states, labels, _ = two_states(slide())
+    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
+    margins = [torch.ones(len(cut))] * 2
+
+    def parts(apart, of):
+        other = slide()
+        other[:3, 3] += torch.tensor([apart, 0.0, 0.0])
+        return PartMotions(["prismatic"] * 2, torch.stack([slide(), other]), torch.ones(2), [of, of], margins)
+
+    joined, log = join_twins(states, parts(0.005, cut), 0.01)
+    assert torch.equal(joined.labels[0], labels) and [entry["type"] for entry in log] == ["prismatic"]
+    assert len(join_twins(states, parts(0.015, cut), 0.01)[0]) == 2  # they travel by different amounts
+    gap = (cut > 0) & ((states[0].gaussians.means[:, 2] - 0.1).abs() < 0.2)
+    assert len(join_twins(states, parts(0.005, torch.where(gap, 0, cut)), 0.01)[0]) == 2  # they do not touch
 
 
 def test_empty_and_unmoving_slots_vanish_with_a_word():

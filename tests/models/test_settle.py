@@ -16,6 +16,9 @@ from p2gs.ops import se3
 COARSE = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0)
 
 
+NO_SURFACES = SimpleNamespace(search=None)  # found: nothing that the surfaces say counts in the energy
+
+
 @pytest.fixture
 def scene(monkeypatch):
     """A slide of one panel; labels are known, what the search would propose is told by the test."""
@@ -29,7 +32,7 @@ def scene(monkeypatch):
         monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: more if part is None else proposed)
         motions = PartMotions([kind], T[None], torch.ones(1), [labels, labels], margins)
         config = PartMotionsConfig(coarse=COARSE, split_reach=0.0)
-        return motions, *settle.reconsider(None, states, motions, views, config, [None, None], limit, seed=0, backend="auto")
+        return motions, *settle.reconsider(NO_SURFACES, states, motions, views, config, [None, None], limit, seed=0, backend="auto")
 
     return reconsider
 
@@ -71,7 +74,7 @@ def test_a_further_part_must_be_found_in_both_states_and_held(monkeypatch, confi
     monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: [(slide(), "prismatic")] if part is None else [])
     wrong = PartMotions(["revolute"], hinge()[None], torch.ones(1), [labels, labels], margins)
     config = PartMotionsConfig(coarse=COARSE, split_reach=0.0)
-    found, log = settle.reconsider(None, states, wrong, views, config, [None, None], 2, seed=0, backend="auto")
+    found, log = settle.reconsider(NO_SURFACES, states, wrong, views, config, [None, None], 2, seed=0, backend="auto")
     assert log[0]["after"] < 0.9 * log[0]["before"] and log[0]["confidence"] == pytest.approx(confidence)
     assert found.types == (["revolute", "prismatic"] if taken else ["revolute"]) and log[0]["evidence"] == evidence
 
@@ -137,8 +140,8 @@ def test_halves_that_the_directions_tell_apart_differently_are_no_parts(monkeypa
     monkeypatch.setattr(settle, "instead_of", lambda *a: [])
     monkeypatch.setattr(settle, "splits", lambda *a, steps=None, **k: [(0, halves)] if steps else [])
     monkeypatch.setattr(settle, "_evidence", lambda *a: [sure] * 2)
-    config = PartMotionsConfig(coarse=COARSE, split_penalty=-1.0, missing_penalty=-1.0)
+    config = PartMotionsConfig(coarse=COARSE)
     for told, parts in ((0.1, 2), (0.9, 1)):
         monkeypatch.setattr(settle, "ways_disagree", lambda *a, told=told, **k: told)
-        found, log = settle.reconsider(None, states, motions, views, config, [None, None], 2, seed=0, backend="auto")
+        found, log = settle.reconsider(NO_SURFACES, states, motions, views, config, [None, None], 2, seed=0, backend="auto")
         assert len(found) == parts and any(entry.get("ways") == told for entry in log)
