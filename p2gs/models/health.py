@@ -9,7 +9,10 @@ from typing import Any, Iterator
 import torch
 from torch import Tensor, nn
 
-from p2gs.types import UserError
+from p2gs.types import GaussianTensors, UserError
+
+
+NUMBERS = (*GaussianTensors.NAMES, "transforms", "probs", "betas")  # fields of hand-over objects
 
 
 class LossNotFinite(UserError):
@@ -61,12 +64,12 @@ def section_of_stage(stage: str) -> str:
 
 
 def _tensors(value: Any) -> Iterator[tuple[str, Tensor]]:
-    """Floating tensors of a hand-over object whose every entry has to be a number (margins may be infinite: nothing contends)."""
+    """Tensors of a hand-over object whose every entry has to be a number (margins may be infinite: nothing contends)."""
     if not dataclasses.is_dataclass(value):
         return
     for f in dataclasses.fields(value):
         item = getattr(value, f.name)
         if dataclasses.is_dataclass(item):
             yield from _tensors(item)
-        elif isinstance(item, Tensor) and item.is_floating_point() and f.name not in ("margin", "mu0", "mu1", "offsets"):
+        elif isinstance(item, Tensor) and f.name in NUMBERS:
             yield f.name, item

@@ -57,8 +57,7 @@ def one(name: str, sound: Path, work: Path, rng: random.Random) -> tuple[str, st
         with contextlib.redirect_stderr(said):
             TARGETS[name].read(work)
     except UserError as err:
-        sentence = str(err)
-        return done, None if sentence and len(sentence) < 2500 and "Traceback" not in sentence else f"no sentence: {sentence[:300]}"
+        return done, None if str(err).strip() and "Traceback" not in str(err) else f"no sentence: {str(err)[:300]}"
     except BaseException:
         return done, traceback.format_exc(limit=-4)
     finally:
