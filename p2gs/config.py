@@ -218,7 +218,7 @@ def _format_found(root: Path) -> str:
     except (OSError, ValueError):  # a name that no folder can have
         present = False
     if not present:
-        raise UserError(f"data.root: the folder {short(str(root), 300)} is not there")
+        raise UserError(f"data.root: the folder {str(root)[:300]} is not there")
     found = detect_format(root)
     if found is None:
         known = ", ".join(LAYOUTS)
