@@ -20,7 +20,9 @@ from p2gs.data.report import Report
 from p2gs.types import Camera, View
 
 DepthMode = Literal["auto", "never", "always"]
-MAX_PIXELS = 2**26  # of one image; the largest sensors in use. A header may claim any number, and the memory would be asked for
+MAX_PIXELS = (
+    2**26
+)  # of one image, 8192 x 8192: a hundred times what is trained on. A header may claim any number, for which memory is asked
 FOCAL_RANGE = (1e-2, 1e8)  # pixels; beyond it all rays are parallel, or at right angles to the camera, in float32
 MIN_DEPTH = 0.1  # scene units (metres in the layouts' words); nearer is invalid, as in DTA and ArtGS
 
