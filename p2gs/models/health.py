@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from p2gs.types import GaussianTensors, UserError
 
-
 NUMBERS = (*GaussianTensors.NAMES, "transforms", "probs", "betas")  # fields of hand-over objects
 
 
