@@ -14,6 +14,7 @@ from typing import Iterator
 from p2gs.types import UserError
 
 PATIENCE = 60.0  # seconds that a killed run's other process may take to save its state and end; as in side_stage
+GRACE = 2.0  # seconds that a process takes to go that has just been killed
 _held: list[int] = []
 
 
@@ -41,14 +42,15 @@ def locked(run_dir: Path) -> Iterator[None]:
                 break
             except BlockingIOError:
                 pid, host = _owner(file)
-                if time.monotonic() - began > PATIENCE or not _gone(pid, host):
+                waited, gone = time.monotonic() - began, _gone(pid, host)
+                if waited > (PATIENCE if gone else GRACE):
                     raise UserError(
                         f"{run_dir}: another fit is running in this folder (process {pid} on {host}); wait until it has ended, "
                         "or name another folder with --run"
                     ) from None
-                if not told:
+                if gone and not told:
                     print(f"{run_dir}: waiting for what is left of process {pid} to save its state", file=sys.stderr, flush=True)
-                told = True
+                told = told or gone
                 time.sleep(0.2)
             except OSError as err:
                 if err.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL):
