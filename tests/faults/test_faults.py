@@ -36,7 +36,7 @@ def test_killed_at_random_moments(whole, tmp_path):
         run, runs = tmp_path / f"run_{runs}", runs + 1
         for _ in range(min(KILLS_A_RUN, KILLS - sum(at.values()))):
             with Fit(whole.config, run) as one:
-                if one.after(rng.randrange(whole.lines), rng.uniform(0, 2 * whole.gap)):
+                if one.after(rng.randrange(whole.lines), rng.uniform(0, whole.gap)):
                     one.process.send_signal(signal.SIGKILL)
                     at[one.stage()] += 1
         whole.same(run, fit(whole.config, run))
