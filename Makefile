@@ -1,4 +1,4 @@
-# make setup | demo | test | sanitize | clean.  PYTHON chooses the interpreter that .venv is made of.
+# make setup | demo | test | fuzz | faults | sanitize | clean.  PYTHON chooses the interpreter that .venv is made of.
 PYTHON ?= python3
 BIN := .venv/bin
 NATIVE := $(wildcard p2gs/native/*.cpp p2gs/native/*.h p2gs/native/*.inc)
@@ -6,7 +6,7 @@ PLATLIB = $(shell $(BIN)/python -c "import sysconfig; print(sysconfig.get_path('
 # Idle threads of torch spin by default, on cores that the kernels want.
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: setup setup-dev native demo test sanitize clean
+.PHONY: setup setup-dev native demo test faults fuzz sanitize clean
 
 setup: .venv/.built
 
@@ -41,6 +41,14 @@ demo: setup
 
 test: setup-dev
 	$(BIN)/python -m pytest --timeout=300
+
+# Kills, full disks, damaged files: KILLS is how many times a run is killed. Hours at 100.
+faults: setup-dev
+	P2GS_KILLS=$(or $(KILLS),100) $(BIN)/python -m pytest -m slow -s tests/faults
+
+# 2,000 damaged scenes, configs, twins and checkpoints (make test has 200).
+fuzz: setup-dev
+	$(BIN)/python -m pytest -m slow tests/fuzz
 
 # The tests of the kernels with address and undefined-behaviour sanitizers.
 sanitize: setup-dev

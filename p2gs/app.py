@@ -8,6 +8,9 @@ import os
 import sys
 from typing import NoReturn
 
+from p2gs.machine import is_of_the_machine, machine_says
+from p2gs.stopping import EXIT_CODE, Terminated
+
 COMMANDS = ("fit", "test", "predict", "export", "view", "data", "bench", "table", "version")
 
 FIT_HELP = """\
@@ -60,6 +63,8 @@ def parser(prog: str = "p2gs") -> Parser:
     fit.add_argument("--seed", metavar="N", help="default 0")
     fit.add_argument("--device", metavar="auto|cpu|cuda", help="default auto")
     fit.add_argument("--threads", metavar="N", help="CPU threads (default all cores)")
+    strict = {"action": "store_true", "help": "refuse files that lead out of the scene's folder (else they are only named)"}
+    fit.add_argument("--strict_paths", "--strict-paths", **strict)
 
     test = add("test", "score a run against the scene's ground truth and write metrics.json")
     test.add_argument("run", metavar="RUN", help="result folder of a fit")
@@ -98,6 +103,7 @@ def parser(prog: str = "p2gs") -> Parser:
     check = actions.add_parser("check", help="name the problems of a scene folder", description="Name the problems of a scene folder.")
     check.add_argument("root", metavar="DIR")
     check.add_argument("--format", metavar="NAME", help="layout (default: found by looking)")
+    check.add_argument("--strict_paths", "--strict-paths", **strict)
     synth = actions.add_parser("synth", help="generate and ray-trace a small scene", description="Generate and ray-trace a small scene.")
     synth.add_argument("out", metavar="OUT", help="folder to write")
     synth.add_argument("--seed", type=int, default=0, metavar="S")
@@ -156,6 +162,9 @@ def parser(prog: str = "p2gs") -> Parser:
 def run(words: list[str], prog: str = "p2gs") -> int:
     """Parse and carry out one command; returns the exit code. Mistakes come as one line ``error: ...`` on stderr."""
     top = parser(prog)
+    for stream in (sys.stdout, sys.stderr):  # names of files may hold bytes that are no text
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
     try:
         if words[:2] == ["bench", "kernels"]:  # has options of its own; a positional of bench would take the values of --key value
             args, rest = argparse.Namespace(command="bench", action="kernels"), words[2:]
@@ -170,14 +179,21 @@ def run(words: list[str], prog: str = "p2gs") -> int:
         return _carry_out(args, rest)
     except UsageError as err:
         return _fail(str(err))
+    except Terminated:
+        return _stopped(words, EXIT_CODE)
     except SystemExit as err:  # argparse after --help; Lightning turns an interrupt into this
         if isinstance(err.__context__, KeyboardInterrupt):
-            return _interrupted(prog, words)
+            return _stopped(words, 130)
         return err.code if isinstance(err.code, int) else int(err.code is not None)
     except KeyboardInterrupt:
-        return _interrupted(prog, words)
+        return _stopped(words, 130)
     except BrokenPipeError:  # the reader of our output has gone (| head)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (OSError, MemoryError) as err:
+        if not is_of_the_machine(err):
+            raise
+        print(f"error: {machine_says(err)}{_go_on(words)}", file=sys.stderr)
         return 1
 
 
@@ -217,10 +233,13 @@ def _fail(message: str) -> int:
     return 2
 
 
-def _interrupted(prog: str, words: list[str]) -> int:
-    go_on = "; give the same command again to go on where it stopped" if words[:1] in (["fit"], ["bench"]) else ""
-    print(f"\nstopped{go_on}", file=sys.stderr)
-    return 130
+def _stopped(words: list[str], code: int) -> int:
+    print(f"\nstopped{_go_on(words)}", file=sys.stderr)
+    return code
+
+
+def _go_on(words: list[str]) -> str:
+    return "; give the same command again to go on where it stopped" if words[:1] in (["fit"], ["bench"]) else ""
 
 
 def _similar(word: str, top: Parser, args: argparse.Namespace) -> str:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Iterable, Literal, Optional, Union
 from p2gs.config_files import Layer, overrides_layer, parse_overrides, provenance, read_config, to_yaml
 from p2gs.registry import load_plugins, suggest
 from p2gs.schema import Leaf, Plain, Section, build, check_keys, complete, merge, plain, section_of, switches
-from p2gs.types import UserError
+from p2gs.types import UserError, short
 
 if TYPE_CHECKING:
     from lightning.pytorch import LightningDataModule
@@ -36,6 +36,7 @@ class Options:
     or auto.  num_parts: including the static base; auto finds out, and a number is the most that discovery may find.
     exact_parts: num_parts is the number of slots instead: of more parts found the alike become one, fewer get spare slots beside them.
     plugins: modules that register losses, callbacks, phases, ...
+    strict_paths: files of the scene that lead out of its folder are refused; they are only named else.
     """
 
     seed: int = 0
@@ -46,8 +47,13 @@ class Options:
     num_parts: Union[int, Literal["auto"]] = "auto"
     exact_parts: bool = False
     plugins: list[str] = field(default_factory=list)
+    strict_paths: bool = False
 
     def __post_init__(self):
+        if self.run is not None and "\0" in self.run:
+            raise UserError(f"run: expected a folder, got {short(self.run)}")
+        if not 0 <= self.seed < 2**32:
+            raise UserError(f"seed: expected a whole number from 0 to {2**32 - 1}, got {short(self.seed)}")
         if self.num_parts != "auto" and self.num_parts < 2:
             raise UserError(f"num_parts: expected at least 2 (it counts the static base), got {self.num_parts}")
         if self.exact_parts and self.num_parts == "auto":
@@ -81,7 +87,7 @@ class RunConfig:
         options: Options = build({name: values[name] for name in own.children}, own)
         self.seed, self.run, self.device, self.threads = options.seed, options.run, options.device, options.threads
         self.rasterizer, self.num_parts, self.plugins = options.rasterizer, options.num_parts, options.plugins
-        self.exact_parts = options.exact_parts
+        self.exact_parts, self.strict_paths = options.exact_parts, options.strict_paths
         self.data_options: Plain = values["data"]
         self._data: Optional[LightningDataModule] = None
         self.phases: dict[str, PhaseSection] = {}
@@ -109,6 +115,7 @@ class RunConfig:
             section = self._schema.children["data"]
             section = Section(section.make, {k: c for k, c in section.children.items() if k != "format"})
             self._data = build(options, section, "data.")
+            self._data.strict_paths = self.strict_paths
         return self._data
 
     @property
@@ -161,7 +168,10 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
     names = [*plugins]
     for layer in layers:
         given = layer.tree.get("plugins") or []
-        names += [given] if isinstance(given, str) else given
+        given = [given] if isinstance(given, str) else given
+        if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+            raise UserError(f"{layer.where}plugins: expected a list of modules, got {short(given)}")
+        names += given
     names = list(dict.fromkeys(map(str, names)))
     load_plugins(tuple(names))
     import_builtins()
@@ -171,6 +181,8 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
         data = layer.tree.get("data")
         if isinstance(data, dict):
             current, root = data.get("format") or current, data.get("root") or root
+            if current is not None and not isinstance(current, str):
+                raise UserError(f"{layer.where}data.format: expected text, got {short(current)}")
         formats.append(current)
     if current is None and isinstance(root, str):
         current = _format_found(Path(root))
@@ -201,8 +213,12 @@ def _format_found(root: Path) -> str:
     """The data format that the folder given as data.root looks like. Raises UserError where it is none, or there is no such folder."""
     from p2gs.data.layouts import LAYOUTS, detect_format
 
-    if not root.is_dir():
-        raise UserError(f"data.root: the folder {root} is not there")
+    try:
+        present = root.is_dir()
+    except (OSError, ValueError):  # a name that no folder can have
+        present = False
+    if not present:
+        raise UserError(f"data.root: the folder {str(root)[:300]} is not there")
     found = detect_format(root)
     if found is None:
         known = ", ".join(LAYOUTS)

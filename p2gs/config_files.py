@@ -13,7 +13,7 @@ import yaml
 
 import p2gs
 from p2gs.schema import Plain, merge, nested
-from p2gs.types import UserError
+from p2gs.types import UserError, short
 
 
 @dataclass
@@ -28,6 +28,8 @@ class _StrictLoader(yaml.SafeLoader):
     """YAML where a key given twice is an error: the first one would be dropped without a word."""
 
     def construct_mapping(self, node, deep=False):
+        if not isinstance(node, yaml.MappingNode):
+            raise yaml.constructor.ConstructorError(None, None, f"expected a mapping, got {node.id}", node.start_mark)
         seen = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
@@ -52,34 +54,79 @@ def find_config(name: str, beside: Optional[Path] = None) -> Path:
     inner = Path(*given.parts[1:]) if given.parts and given.parts[0] == "configs" and len(given.parts) > 1 else given
     tries += [folder / inner for folder in config_folders() if not given.is_absolute()]
     for path in tries:
-        for candidate in (path, path.with_name(path.name + ".yaml")):
-            if candidate.is_file():
+        for candidate in (path, path.with_name(path.name + ".yaml")) if path.name else ():
+            if _is_file(candidate):
                 return candidate
     from p2gs.registry import suggest
 
     known = sorted({str(p.relative_to(f).as_posix()) for f in config_folders() for p in f.rglob("*.yaml")})
-    raise UserError(f"config file '{name}' is not there{suggest(name, known)}")
+    raise UserError(f"config file {short(name)} is not there{suggest(name[:200], known)}")
 
 
-def read_config(name: str, beside: Optional[Path] = None, parents: tuple[Path, ...] = ()) -> list[Layer]:
-    """The layers of a config file: what its ``include`` names first (relative to it), then itself."""
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
+
+
+def read_config(name: str, beside: Optional[Path] = None, parents: tuple[Path, ...] = (), strict: bool = False) -> list[Layer]:
+    """The layers of a config file: what its ``include`` names first (relative to it), then itself.
+
+    An include that leads out of the folder of the file that was named first, and is none of p2gs's own, is named before it is read; where
+    ``strict`` (or the file says ``strict_paths: true``) it is refused with a UserError.
+    """
     path = find_config(name, beside)
+    if parents:
+        _stay_inside(path, parents, strict)
     if path.resolve() in parents:
         raise UserError(f"{path}: includes itself")
     try:
         tree = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)
-    except (yaml.YAMLError, UnicodeDecodeError) as err:
+    except _UNREADABLE as err:
         mark = getattr(err, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
-        raise UserError(f"{path}{line}: {getattr(err, 'problem', None) or err}") from err
+        raise UserError(f"{path}{line}: {getattr(err, 'problem', None) or str(err) or type(err).__name__}") from err
     tree = {} if tree is None else tree
     if not isinstance(tree, dict):
         raise UserError(f"{path}: expected a mapping (key: value), got {type(tree).__name__}")
-    includes = tree.pop("include", [])
+    _check_tree(tree, f"{path}")
+    includes = tree.pop("include", None) or []
+    includes = [includes] if isinstance(includes, str) else includes
+    if not isinstance(includes, list) or not all(isinstance(include, str) for include in includes):
+        raise UserError(f"{path}: include: expected a file or a list of files, got {short(includes)}")
     layers: list[Layer] = []
-    for include in [includes] if isinstance(includes, str) else includes or []:
-        layers += read_config(str(include), path.parent, (*parents, path.resolve()))
+    for include in includes:
+        layers += read_config(include, path.parent, (*parents, path.resolve()), strict or tree.get("strict_paths") is True)
     return [*layers, Layer(tree, f"{path}: ")]
+
+
+def _stay_inside(path: Path, parents: tuple[Path, ...], strict: bool) -> None:
+    real = path.resolve()
+    if any(real.is_relative_to(folder.resolve()) for folder in (parents[0].parent, *config_folders())):
+        return
+    sentence = f"{parents[-1]}: include: leads out of {parents[0].parent}, to {real}"
+    if strict:
+        raise UserError(f"{sentence}; refused, as strict_paths asks")
+    print(f"note: {sentence}", file=sys.stderr, flush=True)
+
+
+# beside its own errors the loader lets those of a date, a number or a tag through that are none
+_UNREADABLE = (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError, OverflowError, OSError)
+MAX_DEPTH = 20  # of a config; the deepest key of ours has 6 levels
+MAX_VALUES = 10_000  # of a config, aliases counted as often as they stand for something; ours have some 400
+
+
+def _check_tree(tree: Plain, where: str) -> None:
+    """Raise UserError where a config is deeper or larger than any can be: aliases make a few lines endless, and what reads them hangs."""
+    count, todo = 0, [(tree, 0)]
+    while todo:
+        value, depth = todo.pop()
+        count += 1
+        if depth > MAX_DEPTH or count > MAX_VALUES:
+            raise UserError(f"{where}: is no config: more than {MAX_DEPTH} levels or {MAX_VALUES} values")
+        inner = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple, set)) else ()
+        todo += [(item, depth + 1) for item in inner]
 
 
 def parse_overrides(words: list[str]) -> list[tuple[str, Any]]:
@@ -107,9 +154,11 @@ def parse_overrides(words: list[str]) -> list[tuple[str, Any]]:
 def _read_value(key: str, text: str) -> Any:
     if text.strip() in ("null", "~") or text.strip()[:1] in ("{", "["):
         try:
-            return yaml.load(text, Loader=_StrictLoader)
-        except yaml.YAMLError as err:
-            raise UserError(f"--{key}: {text!r} cannot be read ({getattr(err, 'problem', err)})") from err
+            value = yaml.load(text, Loader=_StrictLoader)
+        except _UNREADABLE as err:
+            raise UserError(f"--{key}: {short(text)} cannot be read ({getattr(err, 'problem', err)})") from err
+        _check_tree({key: value}, f"--{key}")
+        return value
     return text
 
 

@@ -26,16 +26,20 @@ from p2gs.models.diagnosis import StageResults
 from p2gs.models.discovery.evidence import DepthStack, StateEvidence
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.finish import finish
+from p2gs.models.health import check_result
 from p2gs.models.openings import open_up
 from p2gs.models.owners import hidden_to_owners
 from p2gs.models.part_motions import find_part_motions
 from p2gs.models.phase import Phase
+from p2gs.models.sealed import Damaged, check_seal
 from p2gs.models.sharpen import SharpenPhase
 from p2gs.models.single_state import SingleStatePhase
 from p2gs.models.slots import merge_to, slot_report
 from p2gs.native import keep_memory
+from p2gs.run_lock import locked
 from p2gs.side_stage import SideStage, can_run_beside
 from p2gs.stage_times import note_stage
+from p2gs.stopping import at_step_ends
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError
 
 STAGES = ("single_state", "discovery", "sharpen", "canonical_fusion", "articulation", "finish")
@@ -43,7 +47,9 @@ STAGES = ("single_state", "discovery", "sharpen", "canonical_fusion", "articulat
 
 def run(cfg: RunConfig, only: Optional[str] = None) -> Path:
     """All stages of a run, or the one named ``only`` (anew; those before it must be there). Returns the result folder."""
-    return Pipeline(cfg).run(only)
+    pipeline = Pipeline(cfg)
+    with locked(cfg.run_dir):
+        return pipeline.run(only)
 
 
 class Pipeline:
@@ -121,8 +127,10 @@ class Pipeline:
             return None
         try:
             value, header = handover.load(self.file(stage))
-        except Exception as err:
-            raise UserError(f"{self.file(stage)} cannot be read ({err}); delete it to run that stage again") from err
+        except Damaged as err:
+            print(f"{stage}: {self.file(stage)} is damaged ({err}) and put aside; this stage runs again", flush=True)
+            self.file(stage).replace(self.file(stage).with_suffix(".damaged"))
+            return None
         if stage == "finish" and not (self.run_dir / "twin.json").exists():
             return None
         return value if header.get("key") == self.key(stage) else None
@@ -175,6 +183,7 @@ class Pipeline:
 
     def keep(self, name: str, value: Any) -> None:
         """Save a stage's result; what it would have gone on from is not needed any more."""
+        check_result(name, value)
         handover.save(value, self.file(name), key=self.key(name))
         (self.run_dir / "checkpoints" / f"{name}.ckpt").unlink(missing_ok=True)
 
@@ -276,6 +285,7 @@ class Pipeline:
         """One training phase with a Trainer of its own."""
         from lightning.pytorch import Trainer, seed_everything
         from lightning.pytorch.loggers import TensorBoardLogger
+        from lightning.pytorch.plugins.environments import LightningEnvironment
 
         section = self.cfg.phases[next(n for n in STAGES if stage.startswith(n))]
         seed_everything(self.cfg.seed, verbose=False)
@@ -301,8 +311,10 @@ class Pipeline:
             enable_model_summary=False,
             enable_checkpointing=False,
             num_sanity_val_steps=0,
+            plugins=[LightningEnvironment()],  # on SLURM, too: a run is one process, and resumes from its own checkpoints alone
         )
-        trainer.fit(phase, ckpt_path=self.resumable(stage, key), weights_only=True)
+        with at_step_ends():
+            trainer.fit(phase, ckpt_path=self.resumable(stage, key), weights_only=True)
         if trainer.global_step < phase.total_steps:
             raise KeyboardInterrupt
         return phase.cpu().hand_over()
@@ -313,9 +325,12 @@ class Pipeline:
         if not path.exists():
             return None
         try:
+            check_seal(path)
             stored = torch.load(path, weights_only=True)["hyper_parameters"]
-        except Exception:
-            print(f"{stage}: {path} cannot be read; starting this stage anew", flush=True)
+        except OSError:
+            raise
+        except Exception as err:
+            print(f"{stage}: {path} is damaged ({err}); starting this stage anew", flush=True)
             return None
         if stored.get("key") != key:
             return None

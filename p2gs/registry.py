@@ -8,7 +8,7 @@ import os
 import sys
 from typing import Callable, Generic, Iterator, TypeVar
 
-from p2gs.types import UserError
+from p2gs.types import UserError, short
 
 T = TypeVar("T")
 
@@ -74,8 +74,11 @@ def load_plugins(modules: tuple[str, ...] = ()) -> None:
         sys.path.insert(0, os.getcwd())
     names = [*modules, *filter(None, os.environ.get("P2GS_PLUGINS", "").split(","))]
     for name in names:
+        module = name.removesuffix(".py").replace("/", ".")
+        if not all(part.isidentifier() for part in module.split(".")):
+            raise UserError(f"plugin {short(name)}: expected the name of a module, like my_losses")
         try:
-            importlib.import_module(name.removesuffix(".py").replace("/", "."))
+            importlib.import_module(module)
         except ImportError as err:
             raise UserError(f"plugin '{name}' cannot be imported: {err}") from err
     for point in entry_points(group="p2gs.plugins"):

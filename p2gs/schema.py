@@ -11,13 +11,14 @@ import dataclasses
 import difflib
 import functools
 import inspect
+import math
 import types
 import typing
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, Callable, Iterable, Iterator, Union
 
-from p2gs.types import UserError
+from p2gs.types import UserError, short
 
 Plain = dict[str, Any]
 
@@ -128,7 +129,7 @@ def _check_keys(tree: Plain, section: Section, prefix: str, where: str, known: l
                 _check_keys(value, child, path + ".", where, known)
             elif value is not None:
                 null = " or null" if child.optional else ""
-                raise UserError(f"{where}{path}: expected options (key: value){null}, got {value!r}")
+                raise UserError(f"{where}{path}: expected options (key: value){null}, got {short(value)}")
 
 
 def nearest(path: str, known: list[str]) -> str:
@@ -195,9 +196,12 @@ def typed(value: Any, hint: Any, path: str) -> Any:
     """``value`` as ``hint`` demands (text is read as the command line would give it). Raises UserError naming ``path``."""
     parser = _parser(hint)
     try:
-        return parser.parse_object({"value": value}, defaults=False).value
+        made = parser.parse_object({"value": value}, defaults=False).value
     except Exception as err:  # jsonargparse reports in several lines; the user gets one
-        raise UserError(f"{path}: expected {describe(hint)}, got {value!r}") from err
+        raise UserError(f"{path}: expected {describe(hint)}, got {short(value)}") from err
+    if any(isinstance(x, float) and math.isnan(x) for x in (made if isinstance(made, list) else [made])):
+        raise UserError(f"{path}: expected {describe(hint)}, got {short(value)}")
+    return made
 
 
 def describe(hint: Any) -> str:

@@ -7,8 +7,8 @@ RUN/checkpoints/STAGE.pt, and stops, its state saved, when the pipe to its paren
 
 from __future__ import annotations
 
-import _thread
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -19,6 +19,9 @@ from pathlib import Path
 import torch
 
 from p2gs.config import RunConfig, load_config
+from p2gs.machine import is_of_the_machine, machine_says
+from p2gs.run_lock import held
+from p2gs.stopping import EXIT_CODE, Terminated, heeding_sigterm
 from p2gs.types import UserError
 
 MISTAKE = "error: "  # what a line starts with that tells a user's mistake
@@ -52,6 +55,7 @@ class SideStage:
             stderr=subprocess.STDOUT,
             text=True,
             env={**os.environ, "PYTHONPATH": search},
+            pass_fds=held(),  # while it saves its state after the run was killed, no other run may write there
             start_new_session=True,  # Ctrl-C reaches it through the pipe alone, so once
         )
         self.reader = threading.Thread(target=self._forward, daemon=True)
@@ -82,8 +86,11 @@ class SideStage:
         code = self.process.returncode
         if code:
             mistakes = [line.removeprefix(MISTAKE) for line in self.last if line.startswith(MISTAKE)]
+            if mistakes:
+                raise UserError(mistakes[-1])
             raise UserError(
-                mistakes[-1] if mistakes else f"{self.stage}: its process ended with code {code}; what it said last stands above"
+                f"{self.stage}: its process ended with code {code}{_reason(code)}; what it said last stands above, "
+                "and the same command goes on where it stopped"
             )
         return self.seconds
 
@@ -97,18 +104,33 @@ def main(run_dir: str, stage: str, threads: str) -> int:
     try:
         cfg = load_config([str(Path(run_dir) / "config.yaml")])
         cfg.threads = int(threads)
-        Pipeline(cfg).train_alone(stage)
+        with heeding_sigterm():
+            Pipeline(cfg).train_alone(stage)
     except UserError as err:
         print(MISTAKE + " ".join(str(err).split()), flush=True)
         return 2
+    except OSError as err:
+        if not is_of_the_machine(err):
+            raise
+        print(MISTAKE + machine_says(err), flush=True)
+        return 1
+    except Terminated:
+        return EXIT_CODE
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
         return 130
     return 0
 
 
+def _reason(code: int) -> str:
+    if code == -signal.SIGKILL:
+        return " (it was killed, which is what happens when memory runs out)"
+    return f" ({signal.Signals(-code).name})" if code < 0 else ""
+
+
 def _stop_with_parent() -> None:
+    """As a scheduler would: the step that is being done is finished, its state saved."""
     sys.stdin.read()
-    _thread.interrupt_main()
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 if __name__ == "__main__":

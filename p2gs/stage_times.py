@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Optional
 
@@ -15,9 +16,14 @@ def note_stage(run_dir: Path | str, name: str, seconds: float, peak_memory: int,
     """Write a stage's seconds (of a resumed one the last sitting's) and peak memory (MiB). beside: the stage that ran at the same time."""
     path = stages_file(run_dir)
     path.parent.mkdir(parents=True, exist_ok=True)
-    times = json.loads(path.read_text()) if path.exists() else {}
+    try:
+        times = json.loads(path.read_text())
+    except (FileNotFoundError, ValueError):  # a run that was killed while an older version wrote it; times are told, nothing hangs on them
+        times = {}
     times[name] = {"seconds": round(seconds, 2), "peak_memory_mib": peak_memory} | ({"beside": beside} if beside else {})
-    path.write_text(json.dumps(times, indent=1))
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(times, indent=1))
+    os.replace(part, path)
 
 
 def wall_seconds(stages: dict[str, dict]) -> float:

@@ -7,6 +7,7 @@ centres at +0.5. Quaternions are wxyz. State time ``t`` runs from 0 (start) to 1
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass, field, replace
 from typing import Literal, Optional
 
@@ -230,6 +231,20 @@ class ArticulatedObject:
     parts: list[Part]
     canonical_time: float
     similarity: Similarity = field(default_factory=Similarity)
+
+
+def short(value: object, length: int = 80) -> str:
+    """``repr`` of what a file holds, for a message: one line of at most about so many characters, however large or deep the value."""
+    if isinstance(value, str):
+        text = repr(value[:length])
+    elif isinstance(value, int) and value.bit_length() > 200:  # str() of a longer number is refused, or slow
+        text = "a whole number of many digits"
+    else:
+        text = _REPR.repr(value)
+    return text if len(text) <= length + 2 else f"{text[:length]}..."
+
+
+_REPR = reprlib.Repr()
 
 
 class UserError(Exception):

@@ -28,7 +28,7 @@ def check(args: argparse.Namespace) -> int:
     """Every finding on its own line; 2 where there is an error."""
     from p2gs.data.check import check_dataset
 
-    findings = check_dataset(args.root, args.format)
+    findings = check_dataset(args.root, args.format, strict_paths=args.strict_paths)
     errors = [f.message for f in findings if f.level == "error"]
     for finding in findings:
         if finding.level == "note":

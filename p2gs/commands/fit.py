@@ -14,8 +14,10 @@ FLAGS = ("run", "num_parts", "seed", "device", "threads")
 
 def config_from(args: argparse.Namespace, words: list[str]) -> RunConfig:
     """The config of a parsed command line; ``words`` are the overrides. Raises UserError."""
-    layers = [layer for name in args.config for layer in read_config(name)]
+    layers = [layer for name in args.config for layer in read_config(name, strict=args.strict_paths)]
     overrides = [(name, getattr(args, name)) for name in FLAGS if getattr(args, name) is not None]
+    if args.strict_paths:
+        overrides.append(("strict_paths", "true"))
     if args.movable is not None:
         if args.movable < 1:
             raise UserError(f"--movable: expected at least 1 moving part, got {args.movable}")
@@ -37,8 +39,10 @@ def fit(args: argparse.Namespace, words: list[str]) -> int:
 
     from p2gs import pipeline
     from p2gs.callbacks.base import silence_lightning
+    from p2gs.stopping import heeding_sigterm
 
     silence_lightning()
-    result = pipeline.run(cfg, only=args.only)
+    with heeding_sigterm():
+        result = pipeline.run(cfg, only=args.only)
     print(f"result: {result}")
     return 0

@@ -7,13 +7,15 @@ in OpenGL axes, depth (optional) as uint16 millimetres at the rgba path with ``r
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Optional
 
 import numpy as np
 
-from p2gs.data.frames import STATES, Frame, check_frames, check_K, opengl_pose, read_json
+from p2gs.data.frames import STATES, Frame, check_frames, check_K, opengl_pose, read_json, there
 from p2gs.data.report import Report
+from p2gs.types import short
 
 SPLITS = ("train", "val", "test")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -32,7 +34,15 @@ def image_path(root: Path, file_path: str) -> Path:
     path = root / file_path
     if path.suffix.lower() in (".jpg", ".jpeg") and (path.parent.parent / "rgba").is_dir():
         path = path.parent.parent / "rgba" / f"{path.stem}.png"
-    return path if path.suffix else path.with_suffix(".png")
+    return path if path.suffix or not path.name else path.with_name(path.name + ".png")
+
+
+def _number(value) -> float:
+    """The number, or NaN for what is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def depth_path(image: Path) -> Optional[Path]:
@@ -40,7 +50,7 @@ def depth_path(image: Path) -> Optional[Path]:
     if image.parent.name != "rgba":
         return None
     path = image.parent.parent / "depth" / f"{image.stem}.png"
-    return path if path.is_file() else None
+    return path if there(path) else None
 
 
 def _intrinsics(meta: dict, frame: dict, where: str, report: Report):
@@ -51,7 +61,7 @@ def _intrinsics(meta: dict, frame: dict, where: str, report: Report):
         report.error(f"{where}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images first")
         return None
     if both.get("fl_x"):
-        fx = float(both["fl_x"])
+        fx = both["fl_x"]
         if "cx" not in both or "cy" not in both:
             report.error(f"{where}: has fl_x but no principal point cx, cy")
             return None
@@ -62,8 +72,8 @@ def _intrinsics(meta: dict, frame: dict, where: str, report: Report):
         report.error(f"{where}: has neither camera_angle_x nor fl_x")
         return None
     for key, angle in (("camera_angle_x", angle_x), ("camera_angle_y", angle_y)):
-        if angle is not None and not 0 < float(angle) < np.pi:
-            report.error(f"{where}: {key} is {angle}, but it should be an angle in radians between 0 and pi")
+        if angle is not None and not 0 < _number(angle) < np.pi:
+            report.error(f"{where}: {key} is {short(angle)}, but it should be an angle in radians between 0 and pi")
             return None
     return None, (float(angle_x), None if angle_y is None else float(angle_y))
 
@@ -88,16 +98,21 @@ def index(root: Path, report: Report) -> list[Frame]:
                 if not isinstance(entry, dict) or "file_path" not in entry or "transform_matrix" not in entry:
                     report.error(f"{where} needs 'file_path' and 'transform_matrix'")
                     continue
+                if not isinstance(entry["file_path"], str) or not entry["file_path"]:
+                    report.error(f"{where}: file_path is {short(entry['file_path'])}, expected the path of an image below {root}")
+                    continue
                 image = image_path(root, entry["file_path"])
                 viewmat = opengl_pose(entry["transform_matrix"], where, report)
                 intrinsics = _intrinsics(shared, entry, where, report)
-                if not image.is_file():
+                depth = depth_path(image)
+                if not report.may_read(image) or (depth is not None and not report.may_read(depth)):
+                    continue
+                if not there(image):
                     report.error(f"{image}: image is missing, but {camera_file.name} lists it as frame {i}")
                 elif viewmat is not None and intrinsics is not None:
                     K, fov = intrinsics
                     if entry.get("time") not in (None, state):
-                        report.note(f"{where} has time {entry['time']}, but it is read as state {state} by the file's name")
-                    depth = depth_path(image)
+                        report.note(f"{where} has time {short(entry['time'])}, but it is read as state {state} by the file's name")
                     frames.append(Frame(image.stem, state, split, image, viewmat, K=K, fov=fov, K_source=camera_file, depth=depth))
                 if report.failed and intrinsics is None:
                     break  # the file's own intrinsics are wrong: once is enough

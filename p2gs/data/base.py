@@ -62,7 +62,11 @@ class TwoStateData(LightningDataModule):
         depth: ``auto`` reads depth where it is there, ``never`` leaves it out, ``always`` demands it.
         seed: of the order in which views are visited.
         normalize: ``object`` trains with the object's box (found from the masks) centred and 2 units in diagonal, ``none`` as on disk.
+
+    strict_paths: the run's; files that lead out of ``root`` are refused, not only named.
     """
+
+    strict_paths = False
 
     def __init__(
         self,
@@ -89,7 +93,7 @@ class TwoStateData(LightningDataModule):
         root = Path(self.root or "")
         if not root.is_dir():
             raise UserError(f"{root}: scene folder is missing")
-        report = StrictReport()
+        report = StrictReport(root=root, strict=self.strict_paths)
         frames = thin_out(self.index(root, report), self.max_views)
         views = read_views(frames, report, self.downscale, self.depth)
         check_sizes(frames, views, report)

@@ -11,8 +11,9 @@ from typing import Optional
 
 import numpy as np
 
-from p2gs.data.frames import Frame, check_frames, check_K, opengl_pose
+from p2gs.data.frames import Frame, check_frames, check_K, opengl_pose, there
 from p2gs.data.report import Report
+from p2gs.types import short
 
 
 def detect(root: Path) -> bool:
@@ -24,29 +25,34 @@ def ground_truth_folder(root: Path) -> Optional[Path]:
 
 
 def _read_K(path: Path, report: Report) -> Optional[np.ndarray]:
-    if not path.is_file():
+    if not report.may_read(path):
+        return None
+    if not there(path):
         report.error(f"{path}: camera file is missing")
         return None
     try:
-        values = np.array(path.read_text().replace(",", " ").split(), dtype=np.float64)
-    except ValueError:
+        values = np.array(path.read_text(encoding="utf-8").replace(",", " ").split(), dtype=np.float64)
+    except (ValueError, OSError):
         values = np.empty(0)
     if values.size != 9:
         report.error(f"{path}: should hold the 9 numbers of K")
         return None
-    return check_K(values, str(path), report)
+    return check_K(values.tolist(), str(path), report)
 
 
 def _read_keyframes(path: Path, report: Report) -> Optional[dict]:
     import yaml
 
-    if not path.is_file():
+    if not report.may_read(path):
+        return None
+    if not there(path):
         report.error(f"{path}: camera file is missing")
         return None
     try:
-        keyframes = yaml.load(path.read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except yaml.YAMLError as err:
-        report.error(f"{path}: is not valid YAML ({str(err).splitlines()[0]})")
+        keyframes = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError, OverflowError, OSError) as err:
+        # beside its own errors the loader lets those of a date, a number or a tag through that are none
+        report.error(f"{path}: is not valid YAML ({(str(err) or type(err).__name__).splitlines()[0]})")
         return None
     if not isinstance(keyframes, dict) or not keyframes:
         report.error(f"{path}: has no frames")
@@ -65,18 +71,24 @@ def index(root: Path, report: Report) -> list[Frame]:
     if not has_depth:
         report.note(f"{root / 'depth_filtered'}: folder is missing, so the scene is read without depth")
     for key, entry in keyframes.items():
+        if not isinstance(key, (str, int)):
+            report.error(f"{root / 'init_keyframes.yml'}: {short(key)} is no name of a frame")
+            continue
         name, where = str(key).removeprefix("frame_"), f"{root / 'init_keyframes.yml'}: frame '{key}'"
         if not isinstance(entry, dict) or "cam_in_ob" not in entry:
             report.error(f"{where} has no camera pose 'cam_in_ob'")
             continue
         prefix = name.split("_")[0]
-        time = entry.get("time", int(prefix) if prefix.isdigit() else None)
+        time = entry.get("time", int(prefix) if prefix.isdecimal() and len(prefix) < 10 else None)
         if time not in (0, 1):
-            report.error(f"{where} belongs to the time {time}, but only the states 0 and 1 are supported")
+            report.error(f"{where} belongs to the time {short(time)}, but only the states 0 and 1 are supported")
             continue
         viewmat = opengl_pose(entry["cam_in_ob"], where, report)
         image, mask, depth = (root / folder / f"{name}.png" for folder in ("color_segmented", "mask", "depth_filtered"))
-        missing = [p for p, needed in ((image, True), (mask, True), (depth, has_depth)) if needed and not p.is_file()]
+        needed = [image, mask, depth] if has_depth else [image, mask]
+        if not all(report.may_read(p) for p in needed):
+            continue
+        missing = [p for p in needed if not there(p)]
         for path in missing:
             report.error(f"{path}: image is missing, but init_keyframes.yml has the frame '{key}'")
         if viewmat is not None and not missing:

@@ -17,6 +17,7 @@ from p2gs.types import Split
 
 STATES = ("start", "end")
 ORTHONORMAL_TOLERANCE = 1e-2  # largest entry of |R R^T - I| that passes as rounding of the file's numbers
+MAX_COORDINATE = 1e12  # scene units: farther away float32 has no digits left for an object, and squares near the end of its range
 
 
 @dataclass(frozen=True)
@@ -55,16 +56,52 @@ class Frame:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
+def there(path: Path) -> bool:
+    """Whether the path is a file; a name that no file can have (too long, a NUL in it) is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def read_json(path: Path, report: Report):
     """The parsed file, or None after an error: missing file, or text that is not JSON."""
-    if not path.is_file():
+    if not report.may_read(path):
+        return None
+    if not there(path):
         report.error(f"{path}: camera file is missing")
         return None
     try:
-        return json.loads(path.read_text())
-    except ValueError as err:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError, OSError) as err:
         report.error(f"{path}: is not valid JSON ({err})")
         return None
+
+
+def matrix_of(value, rows: int, cols: int) -> np.ndarray:
+    """[rows, cols] float64 of a nested or flat list of numbers (or their text, as YAML has 1e-05). Raises ValueError for anything else.
+
+    Counts before it converts: with YAML's aliases a short file holds lists without end.
+    """
+    value = value.tolist() if isinstance(value, np.ndarray) else value
+    if not isinstance(value, (list, tuple)):
+        raise ValueError("no list")
+    if len(value) == rows and all(isinstance(row, (list, tuple)) and len(row) == cols for row in value):
+        value = [x for row in value for x in row]
+    if len(value) != rows * cols:
+        raise ValueError(f"{len(value)} entries instead of {rows * cols}")
+    try:
+        return np.array([float(x) for x in value]).reshape(rows, cols)
+    except (TypeError, OverflowError) as err:
+        raise ValueError(str(err)) from err
+
+
+def pose_matrix(value) -> np.ndarray:
+    """[4, 4] float64 of a 4x4 or 3x4 matrix, nested or flat. Raises ValueError."""
+    try:
+        return matrix_of(value, 4, 4)
+    except ValueError:
+        return np.vstack([matrix_of(value, 3, 4), [0, 0, 0, 1.0]])
 
 
 def opengl_pose(matrix, where: str, report: Report) -> Optional[np.ndarray]:
@@ -74,13 +111,15 @@ def opengl_pose(matrix, where: str, report: Report) -> Optional[np.ndarray]:
     projected to the nearest orthonormal one, so that rounding in the file does not become shear.
     """
     try:
-        c2w = np.asarray(matrix, dtype=np.float64)
-        c2w = c2w.reshape(4, 4) if c2w.size == 16 else np.vstack([c2w.reshape(3, 4), [0, 0, 0, 1.0]])
-    except (TypeError, ValueError):
+        c2w = pose_matrix(matrix)
+    except ValueError:
         report.error(f"{where}: camera pose is not a 4x4 matrix of numbers")
         return None
     if not np.isfinite(c2w).all():
         report.error(f"{where}: camera pose holds values that are not finite")
+        return None
+    if np.abs(c2w).max() > MAX_COORDINATE:
+        report.error(f"{where}: camera pose holds {np.abs(c2w).max():g}, expected coordinates below {MAX_COORDINATE:g}")
         return None
     if np.abs(c2w[3] - [0, 0, 0, 1]).max() > 1e-6:
         report.error(f"{where}: last row of the camera pose is {c2w[3].tolist()} instead of [0, 0, 0, 1]")
@@ -103,8 +142,8 @@ def opengl_pose(matrix, where: str, report: Report) -> Optional[np.ndarray]:
 def check_K(K, where: str, report: Report) -> Optional[np.ndarray]:
     """[3, 3] float64 intrinsics, or None after an error: not 3x3, focal length not positive, skew."""
     try:
-        K = np.asarray(K, dtype=np.float64).reshape(3, 3)
-    except (TypeError, ValueError):
+        K = matrix_of(K, 3, 3)
+    except ValueError:
         report.error(f"{where}: K is not a 3x3 matrix of numbers")
         return None
     if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - [0, 0, 1]).max() > 1e-6:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from p2gs.data.layouts import detect_format, layout_named
-from p2gs.types import Joint, UserError
+from p2gs.types import Joint, UserError, short
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,12 @@ def parse_joint(entry: dict, where: str) -> Joint:
         axis, origin = (torch.tensor(entry["axis"][k], dtype=torch.float64).reshape(3) for k in "do")
         span = entry[kind]
         motion = float(span["r"]) - float(span["l"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as err:
-        raise UserError(f"{where} does not describe a joint (axis o and d, type rotate or translate, range l and r): {err!r}") from err
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as err:
+        raise UserError(f"{where} does not describe a joint (axis o and d, type rotate or translate, range l and r): {short(err)}") from err
+    if not (torch.isfinite(axis).all() and torch.isfinite(origin).all() and math.isfinite(motion)):
+        raise UserError(f"{where} holds numbers that are not finite, expected an axis o and d and a range l and r")
     if kind not in ("rotate", "translate") or not axis.norm() > 0:
-        raise UserError(f"{where} needs the type rotate or translate and an axis of some length, but has '{kind}' and {axis.tolist()}")
+        raise UserError(f"{where} needs the type rotate or translate and an axis of some length, but has {short(kind)} and {axis.tolist()}")
     axis = axis / axis.norm()
     if kind == "rotate":
         T = rotation_about(axis, origin, motion)
@@ -102,8 +104,8 @@ def load_ground_truth(root, format: Optional[str] = None, source: Optional[str] 
         return None
     path = folder / "trans.json"
     try:
-        info = json.loads(path.read_text())["trans_info"]
-    except (ValueError, KeyError, TypeError) as err:
+        info = json.loads(path.read_text(encoding="utf-8"))["trans_info"]
+    except (ValueError, KeyError, TypeError, RecursionError, OSError) as err:
         raise UserError(f"{path}: has no readable 'trans_info' ({err})") from err
     entries = info if isinstance(info, list) else [info]
     joints = tuple(parse_joint(e, f"{path}: joint {i}") for i, e in enumerate(entries))

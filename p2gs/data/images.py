@@ -7,6 +7,7 @@ colour behind alpha = 0 does not bleed into the object's edge.
 from __future__ import annotations
 
 import os
+import struct
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, Optional, Sequence
@@ -19,6 +20,10 @@ from p2gs.data.report import Report
 from p2gs.types import Camera, View
 
 DepthMode = Literal["auto", "never", "always"]
+MAX_PIXELS = (
+    2**26
+)  # of one image, 8192 x 8192: a hundred times what is trained on. A header may claim any number, for which memory is asked
+FOCAL_RANGE = (1e-2, 1e8)  # pixels; beyond it all rays are parallel, or at right angles to the camera, in float32
 MIN_DEPTH = 0.1  # scene units (metres in the layouts' words); nearer is invalid, as in DTA and ArtGS
 
 
@@ -95,10 +100,36 @@ def _decode(path: Path, report: Report) -> Optional[np.ndarray]:
     if not path.is_file():
         report.error(f"{path}: file is missing")
         return None
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if not header_fits(path, report):
+        return None
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
     if image is None:
         report.error(f"{path}: cannot be read as an image")
+    elif image.dtype not in (np.uint8, np.uint16):
+        report.error(f"{path}: holds {image.dtype} values, expected 8 or 16 bits a channel")
+        return None
     return image
+
+
+def header_fits(path: Path, report: Report) -> bool:
+    """Whether an image file's header claims no more than ``MAX_PIXELS``; read before any memory is asked for. False after an error."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+    except Image.DecompressionBombError:
+        width = height = MAX_PIXELS
+    except (OSError, ValueError, SyntaxError, TypeError, OverflowError, struct.error):
+        report.error(f"{path}: cannot be read as an image")
+        return False
+    if width * height > MAX_PIXELS:
+        report.error(f"{path}: its header claims more pixels than the {MAX_PIXELS} that an image may have")
+        return False
+    return True
 
 
 def _read_alpha(frame: Frame, image: np.ndarray, report: Report) -> Optional[np.ndarray]:
@@ -144,6 +175,10 @@ def _read_depth(frame: Frame, shape: tuple[int, int], report: Report) -> Optiona
 
 
 def _check_fit(K: np.ndarray, frame: Frame, width: int, height: int, report: Report) -> bool:
+    low, high = FOCAL_RANGE
+    if not (low < K[0, 0] < high and low < K[1, 1] < high):
+        report.error(f"{frame.K_source}: focal length of {K[0, 0]:g} x {K[1, 1]:g} pixels for {frame.image.name} is none of a photograph")
+        return False
     cx, cy = K[0, 2], K[1, 2]
     point, image = f"principal point ({cx:.1f}, {cy:.1f})", f"the {width}x{height} image {frame.image.name}"
     if not (0 < cx < width and 0 < cy < height):
@@ -158,6 +193,9 @@ def read_view(frame: Frame, report: Report, downscale: float = 1.0, depth: Depth
     """The frame's ``View`` in input units, or None after an error in ``report``."""
     pixels = _decode(frame.image, report)
     if pixels is None:
+        return None
+    if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
+        report.error(f"{frame.image}: has {pixels.shape[2]} channels, expected 1, 3 or 4")
         return None
     if pixels.dtype == np.uint16:
         pixels = (pixels >> 8).astype(np.uint8)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Optional
 
-from p2gs.data.frames import STATES, Frame, check_frames, check_K, opengl_pose, read_json
+from p2gs.data.frames import STATES, Frame, check_frames, check_K, opengl_pose, read_json, there
 from p2gs.data.report import Report
 
 SPLITS = ("train", "val", "test")
@@ -99,7 +99,9 @@ def index(root: Path, report: Report, source: Optional[str] = None) -> list[Fram
                     continue
                 viewmat = opengl_pose(matrix, f"{camera_file}: frame '{name}'", report)
                 image = folder / f"{name}.png"
-                if not image.is_file():
+                if not report.may_read(image):
+                    continue
+                if not there(image):
                     report.error(f"{image}: image is missing, but {camera_file.name} has a frame '{name}'")
                 elif viewmat is not None:
                     frames.append(Frame(name, state, split, image, viewmat, K=K, K_source=camera_file))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
-from typing import Literal
+from pathlib import Path
+from typing import Literal, Optional
 
 from p2gs.types import UserError
 
@@ -20,9 +22,15 @@ class Finding:
 
 @dataclass
 class Report:
-    """Collects findings in the order in which they are met."""
+    """Collects findings in the order in which they are met.
+
+    root: the scene's folder, out of which files should not lead (None: anything may be read).  strict: those that do are errors.
+    """
 
     findings: list[Finding] = field(default_factory=list)
+    root: Optional[Path] = None
+    strict: bool = False
+    _named: set[Path] = field(default_factory=set, repr=False)  # folders outside of the root that have been named
 
     def error(self, message: str) -> None:
         self.findings.append(Finding("error", message))
@@ -35,6 +43,29 @@ class Report:
         for finding in findings:
             self.error(finding.message) if finding.level == "error" else self.note(finding.message)
 
+    def may_read(self, path: Path) -> bool:
+        """Whether a file may be opened; asked before it is. One that leads out of the root (``..``, an absolute path, a link) is named,
+        once for each folder that such files lie in; where ``strict``, it is an error and False."""
+        try:
+            real = path.resolve()
+            inside = self.root is None or real.is_relative_to(self.root.resolve())
+        except (OSError, ValueError, RuntimeError):  # a ring of links, a name that no file can have: there is nothing to read
+            return True
+        if inside:
+            return True
+        sentence = f"{path}: leads out of the scene's folder {self.root}, to {real}"
+        if self.strict:
+            self.error(f"{sentence}; refused, as strict_paths asks")
+            return False
+        if real.parent not in self._named:
+            self._named.add(real.parent)
+            self.outside(sentence)
+        return True
+
+    def outside(self, sentence: str) -> None:
+        """A file outside of the root is about to be read."""
+        self.note(sentence)
+
     @property
     def failed(self) -> bool:
         return any(f.level == "error" for f in self.findings)
@@ -46,3 +77,7 @@ class StrictReport(Report):
     def error(self, message: str) -> None:
         super().error(message)
         raise UserError(message)
+
+    def outside(self, sentence: str) -> None:
+        super().outside(sentence)
+        print(f"note: {sentence}", file=sys.stderr, flush=True)

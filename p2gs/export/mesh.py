@@ -132,11 +132,16 @@ def write_mesh(path: Path, mesh: Mesh) -> Path:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """What ``write_mesh`` wrote."""
+    """What ``write_mesh`` wrote. Raises UserError for anything else."""
     data = Path(path).read_bytes()
-    head, body = data.split(b"end_header\n", 1)
-    counts = [int(line.split()[2]) for line in head.decode().splitlines() if line.startswith("element")]
-    vertices = np.frombuffer(body, VERTEX, counts[0])
-    faces = np.frombuffer(body, FACE, counts[1], offset=counts[0] * VERTEX.itemsize)
+    head, _, body = data.partition(b"end_header\n")
+    try:
+        counts = [int(line.split()[2]) for line in head.decode().splitlines() if line.startswith("element")]
+        vertices = np.frombuffer(body, VERTEX, counts[0])
+        faces = np.frombuffer(body, FACE, counts[1], offset=counts[0] * VERTEX.itemsize)
+        if min(counts) < 0 or (len(faces) and (faces["v"].min() < 0 or faces["v"].max() >= len(vertices))):
+            raise ValueError("a face has a vertex that is not there")
+    except (ValueError, IndexError, OverflowError) as err:
+        raise UserError(f"{path} is no mesh of p2gs, or is cut short ({err}); p2gs export RUN --format ply writes it anew") from err
     xyz, rgb = (np.stack([vertices[n] for n in names], 1) for names in (("x", "y", "z"), ("red", "green", "blue")))
     return Mesh(xyz.astype(np.float64), faces["v"].astype(np.int64), rgb)

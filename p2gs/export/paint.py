@@ -49,7 +49,7 @@ def run_rasterizer(run_dir: Path | str) -> str:
         return "auto"
     try:
         config = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as err:
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as err:
         raise UserError(f"{path} is not readable YAML: {err}") from err
     return str((config or {}).get("rasterizer", "auto")) if isinstance(config, dict) else "auto"
 

@@ -35,7 +35,7 @@ def surface_options(run_dir: Path | str) -> SurfaceOptions:
         tree = yaml.safe_load(path.read_text()) or {}
         given = (tree.get("phases") or {}).get("finish") or {}
         return SurfaceOptions(**{f.name: given[f.name] for f in fields(SurfaceOptions) if f.name in given})
-    except (yaml.YAMLError, AttributeError) as err:
+    except (yaml.YAMLError, AttributeError, ValueError, TypeError, RecursionError, OverflowError) as err:
         raise UserError(f"{path}: phases.finish cannot be read ({err}); expected a mapping with complete, whole and cluster") from err
 
 

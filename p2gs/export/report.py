@@ -147,7 +147,8 @@ def score_section(metrics: Optional[dict]) -> str:
         columns |= {"lpips": "LPIPS"} if any("lpips" in v for v in views.values()) else {}
         columns |= {"depth_median": "depth error, median", "depth_p90": "90 %"} if depth else {}
         keys, head = list(columns), ["state", "views", *columns.values()]
-        rows = [[k, f"{v['count']} {v['split']}" if "count" in v else "", *(_number(v.get(n)) for n in keys)] for k, v in views.items()]
+        counts = {k: html.escape(f"{v['count']} {v['split']}") if "count" in v else "" for k, v in views.items()}
+        rows = [[html.escape(k), counts[k], *(_number(v.get(n)) for n in keys)] for k, v in views.items()]
         out.append(table(head, rows))
     chamfer = metrics.get("chamfer")
     if chamfer:

@@ -57,8 +57,11 @@ def read_splat_ply(path: Path | str) -> tuple[GaussianTensors, Optional[Tensor]]
     rest = sum(1 for n in names if n.startswith("f_rest_"))
     need = [n for n in splat_dtype(rest // 3 + 1, False).names if n not in ("nx", "ny", "nz")]
     missing = [n for n in need if n not in names]
-    if missing or rest % 3:
+    if missing or rest // 3 + 1 not in (1, 4, 9, 16) or rest % 3:
         raise UserError(f"{path} is not a Gaussian splat PLY: column '{(missing or ['f_rest_*'])[0]}' is missing")
+    wrong = [n for n in need if not np.isfinite(rows[n]).all()]
+    if wrong:
+        raise UserError(f"{path}: column '{wrong[0]}' holds values that are not finite")
 
     def take(columns) -> Tensor:
         return torch.from_numpy(np.stack([rows[c].astype(np.float32) for c in columns], axis=1))
@@ -97,12 +100,16 @@ def _read_vertices(path: Path) -> np.ndarray:
     count, fields, inside = 0, [], False
     for words in (line.split() for line in lines):
         if words[:1] == ["element"]:
-            inside = words[1] == "vertex"
+            inside = words[1:2] == ["vertex"]
+            if inside and (len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 18):
+                raise UserError(f"{path}: the number of Gaussians in its header cannot be read")
             count = int(words[2]) if inside else count
         elif words[:1] == ["property"] and inside:
-            if words[1] not in PLY_TYPES:
-                raise UserError(f"{path}: property '{words[-1]}' of type '{words[1]}' cannot be read")
+            if len(words) != 3 or words[1] not in PLY_TYPES:
+                raise UserError(f"{path}: property '{' '.join(words[1:])}' cannot be read")
             fields.append((words[-1], "<" + PLY_TYPES[words[1]]))
+    if len({name for name, _ in fields}) < len(fields):
+        raise UserError(f"{path}: two properties have one name")
     dtype = np.dtype(fields)
     body = data[end + len(b"end_header\n") :]
     if len(body) < count * dtype.itemsize:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import torch
 
 from p2gs.export.frame import object_to_input, with_counts
 from p2gs.export.splat_ply import read_splat_ply
-from p2gs.types import ArticulatedObject, Joint, Part, UserError
+from p2gs.types import ArticulatedObject, Joint, Part, UserError, short
 
 FORMAT = "p2gs-twin/1"
 CANONICAL = "splats/canonical.ply"
@@ -41,12 +42,25 @@ def read_twin_json(path: Path | str) -> tuple[list[Part], float]:
     if not path.is_file():
         raise UserError(f"{path} is not there: '{path.parent}' is no finished run (p2gs fit writes it at the end)")
     try:
-        data = json.loads(path.read_text())
-    except ValueError as err:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as err:
         raise UserError(f"{path} is not readable JSON: {err}") from err
-    if data.get("format") != FORMAT:
-        raise UserError(f"{path} says format '{data.get('format')}', expected '{FORMAT}'")
-    return [_read_part(p) for p in data["parts"]], float(data["canonical_time"])
+    kind = data.get("format") if isinstance(data, dict) else None
+    if kind != FORMAT:
+        raise UserError(f"{path} says format {short(kind)}, expected '{FORMAT}'")
+    parts = []
+    try:
+        time = float(data["canonical_time"])
+        for part in data["parts"]:
+            parts.append(_read_part(part, len(parts)))
+        if not parts or not 0 <= time <= 1:
+            raise ValueError(f"{len(parts)} parts, canonical_time {time:g}")
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, RuntimeError, AttributeError) as err:
+        raise UserError(
+            f"{path}: part {len(parts)} cannot be read ({type(err).__name__}: {short(str(err))}); expected a canonical_time in 0..1, "
+            "the static part 0 and movable ones with a joint (type, axis, origin, motion, limits, transform)"
+        ) from err
+    return parts, time
 
 
 def load_twin(run_dir: Path | str) -> ArticulatedObject:
@@ -58,6 +72,8 @@ def load_twin(run_dir: Path | str) -> ArticulatedObject:
     gaussians, part_ids = read_splat_ply(run_dir / CANONICAL)
     if part_ids is None:
         raise UserError(f"{run_dir / CANONICAL} has no part_id column, so its Gaussians belong to no part")
+    if len(gaussians) == 0 or int(part_ids.min()) < 0 or int(part_ids.max()) >= len(parts):
+        raise UserError(f"{run_dir / CANONICAL} does not fit twin.json: its part_id leave 0..{len(parts) - 1}, or it holds no Gaussian")
     return ArticulatedObject(gaussians, part_ids, parts, canonical_time)
 
 
@@ -81,14 +97,27 @@ def _part_dict(part: Part) -> dict:
     }
 
 
-def _read_part(data: dict) -> Part:
-    if data["kind"] == "static":
-        return Part(int(data["id"]), None, int(data.get("gaussians", 0)), float(data.get("confidence", 1.0)))
+def _read_part(data: dict, number: int) -> Part:
+    """The part of that number. Raises one of the errors of an index, a conversion or a value for what is none."""
+    if data["kind"] != ("movable" if number else "static") or int(data["id"]) != number:
+        raise ValueError(f"kind {short(data['kind'])}, id {short(data['id'])}")
+    count, confidence = int(data.get("gaussians", 0)), float(data.get("confidence", 1.0))
+    if count < 0 or not math.isfinite(confidence):
+        raise ValueError(f"gaussians {count}, confidence {confidence}")
+    if number == 0:
+        return Part(0, None, count, confidence)
     j = data["joint"]
 
-    def tensor(value) -> torch.Tensor:
-        return torch.tensor(value, dtype=torch.float64)
+    def tensor(key: str, *shape: int) -> torch.Tensor:
+        value = torch.tensor(j[key], dtype=torch.float64)
+        if tuple(value.shape) != shape or not bool(torch.isfinite(value).all()):
+            raise ValueError(f"{key} {short(j[key])}")
+        return value
 
-    limits = (float(j["limits"][0]), float(j["limits"][1]))
-    joint = Joint(j["type"], tensor(j["axis"]), tensor(j["origin"]), float(j["motion"]), limits, tensor(j["transform"]))
-    return Part(int(data["id"]), joint, int(data["gaussians"]), float(data["confidence"]))
+    axis, transform, low, high = tensor("axis", 3), tensor("transform", 4, 4), float(j["limits"][0]), float(j["limits"][1])
+    motion = float(j["motion"])
+    if j["type"] not in ("revolute", "prismatic") or abs(float(axis.norm()) - 1) > 1e-3:
+        raise ValueError(f"type {short(j['type'])}, axis {short(j['axis'])}")
+    if not (math.isfinite(motion) and math.isfinite(low) and math.isfinite(high) and low <= high):
+        raise ValueError(f"motion {motion}, limits {low}, {high}")
+    return Part(number, Joint(j["type"], axis, tensor("origin", 3), motion, (low, high), transform), count, confidence)

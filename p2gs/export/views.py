@@ -17,7 +17,7 @@ from torch import Tensor
 
 from p2gs.export.frame import camera_to_input
 from p2gs.export.pose import pose
-from p2gs.types import ArticulatedObject, Camera, TwoStateScene
+from p2gs.types import ArticulatedObject, Camera, TwoStateScene, UserError, short
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,24 @@ def write_cameras(path: Path, cameras: Sequence[NamedCamera]) -> None:
 
 
 def read_cameras(path: Path) -> list[NamedCamera]:
-    """Inverse of ``write_cameras``; an empty list where the file is not there."""
+    """Inverse of ``write_cameras``; an empty list where the file is not there. Raises UserError where it cannot be read."""
     if not path.is_file():
         return []
-    rows = json.loads(path.read_text())["cameras"]
-    return [
-        NamedCamera(r["name"], r["state"], r["split"], Camera(torch.tensor(r["viewmat"]), torch.tensor(r["K"]), r["width"], r["height"]))
-        for r in rows
-    ]
+    try:
+        return [_read_camera(row) for row in json.loads(path.read_text(encoding="utf-8"))["cameras"]]
+    except (ValueError, KeyError, TypeError, RuntimeError, OverflowError, RecursionError) as err:
+        why = f"{type(err).__name__}: {short(str(err))}"
+        raise UserError(f"{path}: cannot be read ({why}); expected the cameras that p2gs fit wrote") from err
+
+
+def _read_camera(row: dict) -> NamedCamera:
+    viewmat, K = (torch.tensor(row[key], dtype=torch.float32) for key in ("viewmat", "K"))
+    if viewmat.shape != (4, 4) or K.shape != (3, 3) or not (torch.isfinite(viewmat).all() and torch.isfinite(K).all()):
+        raise ValueError("viewmat or K is no matrix of numbers")
+    width, height = int(row["width"]), int(row["height"])
+    if not (0 < width < 2**16 and 0 < height < 2**16 and row["state"] in (0, 1) and K[0, 0] > 0 and K[1, 1] > 0):
+        raise ValueError(f"{width}x{height} pixels, state {short(row['state'])}")
+    return NamedCamera(str(row["name"]), row["state"], str(row["split"]), Camera(viewmat, K, width, height))
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor, width: int, height: int, focal: float) -> Camera:

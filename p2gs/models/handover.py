@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import os
+import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Optional
@@ -11,6 +11,7 @@ from typing import Optional
 import torch
 from torch import Tensor
 
+from p2gs.models.sealed import Damaged, check_seal, seal
 from p2gs.types import GaussianTensors
 
 
@@ -121,14 +122,21 @@ def _unpack(value):
 
 
 def save(value, path: Path, **header) -> None:
-    """Write a hand-over object atomically (a killed run never leaves half a file)."""
+    """Write a hand-over object atomically (a killed run never leaves half a file), sealed. Raises OSError, for a full disk among others."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    torch.save({"header": header, "value": _pack(value)}, part)
-    os.replace(part, path)
+    part, data = path.with_suffix(".part"), io.BytesIO()
+    torch.save({"header": header, "value": _pack(value)}, data)  # into memory: torch tells no reason when a disk is full
+    part.write_bytes(data.getbuffer())
+    seal(part, path)
 
 
 def load(path: Path):
-    """Returns (value, header)."""
-    stored = torch.load(path, weights_only=True)
-    return _unpack(stored["value"]), stored["header"]
+    """Returns (value, header). Raises ``sealed.Damaged`` for a file that is not as it was written, OSError where it cannot be read."""
+    check_seal(path)
+    try:
+        stored = torch.load(path, weights_only=True)
+        return _unpack(stored["value"]), stored["header"]
+    except OSError:
+        raise
+    except Exception as err:  # whatever torch says of what is no checkpoint of ours
+        raise Damaged(f"it is no result of a stage ({type(err).__name__})") from err

@@ -14,10 +14,12 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.adam import NamedAdam
+from p2gs.models.health import check_gaussians, check_loss
 from p2gs.models.splats import Splats
 from p2gs.native import serial_torch
 from p2gs.registry import Registry
 from p2gs.render import draws_natively
+from p2gs.stopping import leave_if_asked
 from p2gs.types import UserError
 
 PHASES: Registry[type["Phase"]] = Registry("phase")
@@ -124,7 +126,8 @@ class Phase(LightningModule):
     def generator(self, step: int, purpose: int = 0) -> torch.Generator:
         """A generator that depends on (seed, phase, step, purpose) only."""
         name = sum((i + 1) * ord(c) for i, c in enumerate(self.phase_name))
-        return torch.Generator().manual_seed(((self.seed * 1_000_003 + name) * 1_000_003 + step) * 31 + purpose)
+        number = ((self.seed * 1_000_003 + name) * 1_000_003 + step) * 31 + purpose
+        return torch.Generator().manual_seed(number % 2**63)
 
     def configure_optimizers(self):
         groups = [{"params": list(params), "lr": lr, "name": name} for name, (params, lr) in self.parameter_groups().items()]
@@ -147,13 +150,17 @@ class Phase(LightningModule):
         self.scalars["loss/total"] = total.detach()
         return total
 
+    def on_train_start(self):
+        leave_if_asked()
+
     def training_step(self, batch, batch_idx):
         with serial_torch(draws_natively(self.splats.means, self.rasterizer)):
             self.one_step()
 
     def one_step(self) -> None:
-        """Render, losses, backward pass, optimiser."""
+        """Render, losses, backward pass, optimiser. Raises UserError where no Gaussian is left and where the loss is not finite."""
         step = self.step
+        check_gaussians(self.phase_name, len(self.splats))
         optimizer = self.optimizers()
         rates = self.learning_rates(step)
         for group in optimizer.param_groups:
@@ -161,7 +168,9 @@ class Phase(LightningModule):
                 group["lr"] = rates[group["name"]]
         inputs = self.inputs(step)
         optimizer.zero_grad(set_to_none=True)
-        self.total_loss(inputs).backward()
+        total = self.total_loss(inputs)
+        check_loss(self.phase_name, step, self.scalars)
+        total.backward()
         if self.track_gradients and inputs.render is not None and inputs.render.means2d_abs_grad is not None:
             # in units of the full image, so that levels of the resolution schedule weigh alike
             self.splats.note_gradients(inputs.render.means2d_abs_grad, inputs.render.radii, float(inputs.render.alpha.shape[0]))

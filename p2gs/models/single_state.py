@@ -12,6 +12,7 @@ from torch import Tensor
 from p2gs.data.views import TrainingViews, view_index
 from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.handover import StateGaussians
+from p2gs.models.health import check_gaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
 from p2gs.models.phase import Phase, PhaseConfig, exponential, register_phase
 from p2gs.models.splats import Splats, SplitGaussians
@@ -200,4 +201,5 @@ class SingleStatePhase(StatePhase):
         if self.config.min_visible > 0 and len(g):
             cameras = [views.camera(i, views.levels.index(self.config.levels[-1])) for i in range(len(views))]
             g = g[visible_share(g, cameras, self.rasterizer, g.means.device) >= self.config.min_visible]
+        check_gaussians(self.phase_name, len(g), len(self.splats))
         return StateGaussians(self.state, g)

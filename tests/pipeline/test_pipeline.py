@@ -119,7 +119,7 @@ def test_everything_that_can_be_null(folder, tmp_path):
 
 
 def test_an_empty_reconstruction_is_told(folder, tmp_path):
-    done = fit(folder, "--run", str(tmp_path / "empty"), "--phases.single_state.steps=2")
+    done = fit(folder, "--run", str(tmp_path / "empty"), "--phases.single_state.steps=2", "--phases.single_state.initial_opacity=0.1")
     assert done.returncode == 2 and "nothing opaque" in done.stderr and "Traceback" not in done.stderr, done.stderr
 
 

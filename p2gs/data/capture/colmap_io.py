@@ -50,7 +50,7 @@ def read_model(folder: Path) -> Model:
     for path, reader in zip(paths, readers, strict=True):
         try:
             parsed.append(reader(path))
-        except (struct.error, ValueError, IndexError, KeyError) as err:
+        except (struct.error, ValueError, IndexError, KeyError, TypeError, OverflowError) as err:
             raise UserError(f"{path}: is no COLMAP file of this kind, or is cut short ({err!r})") from err
     lenses, photos, (ids, xyz, rgb) = parsed
     for photo in photos.values():
@@ -65,6 +65,8 @@ def read_model(folder: Path) -> Model:
 
 def _viewmat(quat_wxyz, t) -> np.ndarray:
     view = np.eye(4)
+    if not (np.isfinite(quat_wxyz).all() and np.isfinite(t).all()):
+        raise ValueError("a pose that is not finite")
     view[:3, :3] = Rotation.from_quat(np.roll(np.asarray(quat_wxyz, float), -1)).as_matrix()
     view[:3, 3] = t
     return view
@@ -93,6 +95,8 @@ class _Bytes:
 
 def _lens(name: str, width, height, params) -> Lens:
     params = np.asarray(params, float)
+    if not np.isfinite(params).all() or min(int(width), int(height)) < 1:
+        raise ValueError(f"{width}x{height} pixels, parameters {params}")
     if name in LENS_MODELS and len(params) != LENS_MODELS[name]:
         raise ValueError(f"{name} has {len(params)} parameters, expected {LENS_MODELS[name]}")
     return Lens(name, int(width), int(height), params)

@@ -33,7 +33,10 @@ def read_mask(path: Path, shot: Shot, ignore: bool) -> np.ndarray:
     """
     import cv2
 
-    mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    try:
+        mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # a header that claims more than OpenCV takes
+        mask = None
     if mask is None:
         raise UserError(f"{path}: cannot be read as an image")
     if mask.ndim == 3:

@@ -103,7 +103,7 @@ def _copied(path: Path, state: str, index: int, folder: Path, size: int) -> Shot
             exif = image.getexif()
             focal, device = _focal_35(exif), str(exif.get(EXIF_MODEL, "")).strip()
             pixels = np.asarray(ImageOps.exif_transpose(image).convert("RGBA" if "A" in image.getbands() else "RGB"))
-    except (OSError, UnidentifiedImageError) as err:
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError, ValueError, SyntaxError, OverflowError) as err:
         raise UserError(f"{path}: cannot be read as a photograph ({err})") from err
     if min(pixels.shape[:2]) < 200:
         raise UserError(

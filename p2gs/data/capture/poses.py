@@ -15,7 +15,7 @@ import numpy as np
 from p2gs.data.capture.colmap_io import find_model, read_model
 from p2gs.data.capture.model import ONE_FOCAL, Lens, Model, Photo
 from p2gs.data.capture.photos import Shot
-from p2gs.data.frames import opengl_pose
+from p2gs.data.frames import MAX_COORDINATE, opengl_pose, pose_matrix
 from p2gs.data.report import Report
 from p2gs.types import UserError
 
@@ -52,6 +52,8 @@ def _frame_lens(meta: dict, frame: dict, where: str) -> Lens:
     if "distortion_params" in both:
         k.update(zip(("k1", "k2", "k3", "k4", "p1", "p2"), map(float, both["distortion_params"]), strict=False))
     size = (int(both["w"]), int(both["h"]))
+    if min(*size, focal[0], focal[1]) <= 0 or not np.isfinite([*focal, *k.values()]).all():
+        raise ValueError(f"w, h {size}, focal lengths and centre {focal}")
     if kind == "OPENCV_FISHEYE":
         return Lens(kind, *size, np.array([*focal, k["k1"], k["k2"], k["k3"], k["k4"]]))
     if kind in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
@@ -66,11 +68,25 @@ def _frame_lens(meta: dict, frame: dict, where: str) -> Lens:
 def _unapplied(meta: dict, where: str) -> np.ndarray:
     """[4, 4] that takes the file's coordinates back to those of its reconstruction (undoes ``applied_transform``)."""
     T = np.eye(4)
-    given = np.asarray(meta.get("applied_transform", T[:3]), float)
-    if given.shape not in ((3, 4), (4, 4)) or abs(np.linalg.det(given[:3, :3])) < 1e-9:
+    given = meta.get("applied_transform", T)
+    try:
+        T[:3] = pose_matrix(given)[:3]
+    except ValueError:
+        T[:3] = 0
+    if not (np.abs(T) < MAX_COORDINATE).all() or abs(np.linalg.det(T[:3, :3])) < 1e-9:
         raise UserError(f"{where}: applied_transform is not a 3x4 matrix that can be undone")
-    T[:3] = given[:3]
     return np.linalg.inv(T)
+
+
+def _c2w(given, where: str) -> np.ndarray:
+    """[4, 4] of a frame's transform_matrix. Raises UserError for what is no pose."""
+    try:
+        c2w = pose_matrix(given)
+    except ValueError as err:
+        raise UserError(f"{where}: camera pose is not a 4x4 matrix of numbers") from err
+    if not (np.abs(c2w) < MAX_COORDINATE).all() or abs(np.linalg.det(c2w[:3, :3])) < 1e-9:
+        raise UserError(f"{where}: camera pose has no rotation, or values that are not finite")
+    return c2w
 
 
 def read_transforms(files: list[tuple[Path, str]]) -> Model:
@@ -84,22 +100,23 @@ def read_transforms(files: list[tuple[Path, str]]) -> Model:
     for path, prefix in files:
         try:
             meta = json.loads(path.read_text())
-        except ValueError as err:
+        except (ValueError, RecursionError) as err:
             raise UserError(f"{path}: is not valid JSON ({err})") from err
         if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
             raise UserError(f"{path}: has no list 'frames'")
         undo = _unapplied(meta, str(path))
         for i, frame in enumerate(meta["frames"]):
             where = f"{path}: frame {i}"
-            if "file_path" not in frame or "transform_matrix" not in frame:
+            if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or "transform_matrix" not in frame:
                 raise UserError(f"{where} needs 'file_path' and 'transform_matrix'")
-            lens = _frame_lens(meta, frame, where)
+            try:
+                lens = _frame_lens(meta, frame, where)
+            except (TypeError, ValueError, OverflowError) as err:
+                raise UserError(f"{where}: its lens cannot be read ({err}); expected numbers fl_x, fl_y, cx, cy, w, h") from err
             key = known.setdefault((lens.model, lens.width, lens.height, lens.params.tobytes()), len(known) + 1)
             lenses[key] = lens
-            report, c2w = Report(), np.eye(4)
-            given = np.asarray(frame["transform_matrix"], float)
-            c2w[: given.shape[0]] = given
-            viewmat = opengl_pose(_rigid(undo @ c2w), where, report)
+            report = Report()
+            viewmat = opengl_pose(_rigid(undo @ _c2w(frame["transform_matrix"], where)), where, report)
             if viewmat is None:
                 raise UserError(report.findings[0].message)
             photos[len(photos) + 1] = Photo(prefix + frame["file_path"], key, viewmat)
