@@ -43,11 +43,7 @@ def write_usd(
         f'def Xform "twin" (prepend apiSchemas = {json.dumps(schemas)})',
         "{",
         *(f"    token[] semantics:labels:{taxonomy} = [{json.dumps(label)}]" for taxonomy, label in labels),
-        '    def Material "contact" (prepend apiSchemas = ["PhysicsMaterialAPI"])',
-        "    {",
-        f"        float physics:staticFriction = {FRICTION}",
-        f"        float physics:dynamicFriction = {FRICTION}",
-        "    }",
+        *_contact(asset.material if asset.links[0].label else ""),
     ]
     for link in asset.links:
         lines += _link(link)
@@ -76,6 +72,19 @@ def layer_data(data: Mapping[str, Value], depth: int = 1, head: str = "customLay
         else:
             lines.append(f"{indent}    float3 {key} = {_tuple(value)}")
     return [indent + head, *lines, indent + "}"]
+
+
+def _contact(label: str) -> list[str]:
+    """The physics material of all collision pieces, labelled by what the object is made of, if it is labelled at all."""
+    schemas = ["PhysicsMaterialAPI", *(["SemanticsLabelsAPI:material"] if label else [])]
+    return [
+        f'    def Material "contact" (prepend apiSchemas = {json.dumps(schemas)})',
+        "    {",
+        *([f'        token[] semantics:labels:material = ["{label}"]'] if label else []),
+        f"        float physics:staticFriction = {FRICTION}",
+        f"        float physics:dynamicFriction = {FRICTION}",
+        "    }",
+    ]
 
 
 def _link(link: Link) -> list[str]:
@@ -151,7 +160,7 @@ def _material(link: Link, label: str) -> list[str]:
 def _mesh(name: str, vertices: np.ndarray, faces: np.ndarray, extra: list[str], schemas: list[str]) -> list[str]:
     rows = [
         f"point3f[] points = {_array(vertices, 7)}",
-        f"float3[] extent = {_array(np.array([vertices.min(0), vertices.max(0)]), 9)}",
+        f"float3[] extent = {_array(np.array([vertices.min(0), vertices.max(0)]), 7)}",  # of the points as they are written
         f"normal3f[] normals = {_array(vertex_normals(vertices, faces), 4)} (",
         '    interpolation = "vertex"',
         ")",

@@ -118,8 +118,12 @@ def test_simready_has_its_folders_metadata_labels_and_thumbnail(run, tmp_path):
     assert np.allclose(told["asset_extents"], box.GetSize(), atol=1e-4)
     assert list(stage.GetDefaultPrim().GetAttribute("semantics:labels:class").Get()) == ["StorageFurniture"]
     assert list(stage.GetDefaultPrim().GetAttribute("semantics:labels:wikidata_qcode").Get()) == ["Q10498396"]
-    looks = [p for p in stage.Traverse() if p.IsA(UsdShade.Material) and p.GetName() != "contact"]
-    assert len(looks) == 3 and all(list(p.GetAttribute("semantics:labels:material").Get()) == ["wood"] for p in looks)
+    looks = [p for p in stage.Traverse() if p.IsA(UsdShade.Material)]
+    assert len(looks) == 4 and all(list(p.GetAttribute("semantics:labels:material").Get()) == ["wood"] for p in looks)
+    for prim in (p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)):  # SimReady's rule VG.002 compares them as they are written
+        assert (
+            UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default()) == prim.GetAttribute("extent").Get()
+        )
     colliders = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.CollisionAPI)]
     for prim in colliders:
         contact = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
