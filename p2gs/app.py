@@ -81,15 +81,25 @@ def parser(prog: str = "p2gs") -> Parser:
 
     export = add("export", "write a run's twin in other formats")
     export.add_argument("run", metavar="RUN", help="result folder of a fit")
-    export.add_argument("--format", nargs="+", default=["all"], metavar="NAME", help="urdf, mjcf, glb, usd, ply, obj, all (default)")
+    export.add_argument("--format", nargs="+", metavar="NAME", help="urdf, mjcf, glb, usd, splats, ply, obj, all (default)")
+    told = "all that one simulator takes, named and textured, into --out: simready, isaac, mujoco, sapien, partnet"
+    export.add_argument("--profile", metavar="NAME", help=told)
+    export.add_argument("--meta", metavar="FILE", help="YAML or JSON with author, asset_license, category, qcode, ... for --profile")
     export.add_argument("--out", metavar="DIR", help="folder to write to (default RUN)")
+    stand = export.add_mutually_exclusive_group()
+    told = "the base stands fast in the world (URDF: on a link 'world')"
+    stand.add_argument("--fixed_base", "--fixed-base", dest="fixed", action="store_true", default=None, help=told)
+    stand.add_argument("--floating", dest="fixed", action="store_false", default=None, help="the base may be pushed and fall over")
     size = export.add_mutually_exclusive_group()
     size.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of the input (default 1)")
     size.add_argument("--height", type=float, metavar="M", help="the object's height at the start in metres, instead of --scale")
     export.add_argument("--material", default="chipboard", help="density: chipboard (default), wood, plastic, metal, glass, ceramic")
+    told = "call parts by what they are (drawer, door, lid, ...), needs --out; those that geometry gets wrong as PART=NAME"
+    export.add_argument("--name", nargs="*", metavar="PART=NAME", help=told)
     export.add_argument("--up", choices=("x", "y", "z"), help="axis that points up in the file (default: the format's own)")
     export.add_argument("--extend_range", "--extend-range", action="store_true", help="joint limits until parts touch, not as observed")
     export.add_argument("--texture", action="store_true", help="baked textures, for programs that show no vertex colours")
+    export.add_argument("--splats", action="store_true", help="each part's Gaussians in USD too (OpenUSD 26.03 and later show them)")
     export.add_argument("--check", action="store_true", help="write nothing: run the files that are there in every engine installed")
     export.add_argument("--origin", choices=("keep", "center", "bottom"), default="keep", help="where the origin is put (default keep)")
 

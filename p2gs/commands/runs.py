@@ -71,8 +71,31 @@ def export(args: argparse.Namespace) -> int:
     run = finished_run(args.run)
     if args.check:
         return _check(run if args.out is None else Path(args.out))
+    from p2gs.export.formats import export_profile, export_run
+    from p2gs.export.naming import parse_names
+
+    if args.meta is not None and args.profile is None:
+        raise UserError("--meta: no format but a profile holds it; give --profile simready or partnet as well")
+    if args.profile is not None and args.format is not None:
+        raise UserError(f"--format: the profile {args.profile} has its own; give one or the other")
+    options = {name: getattr(args, name) for name in ("up", "origin", "extend_range", "material", "fixed", "splats")}
+    options |= {"scale": _metres_per_unit(args, run), "names": None if args.name is None else parse_names(args.name), "note": _warn}
+    if args.profile is not None:
+        written = export_profile(run, args.profile, args.out, args.meta, **options)
+    else:
+        written = export_run(run, args.format or ["all"], out=args.out, texture=args.texture, **options)
+    for path in written:
+        print(path)
+    return 0
+
+
+def _warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
+
+
+def _metres_per_unit(args: argparse.Namespace, run: Path) -> float:
+    """Of --scale or --height; warns where the object comes out in a size that nothing has."""
     from p2gs.export.asset import start_box, unlikely_size
-    from p2gs.export.formats import export_run
 
     if not args.scale > 0:
         raise UserError(f"--scale: expected a positive number of metres per unit, got {args.scale:g}")
@@ -84,11 +107,8 @@ def export(args: argparse.Namespace) -> int:
         scale = args.height / float(sides[2])
     unlikely = unlikely_size(scale * float(sides.max()))
     if unlikely is not None:
-        print(f"warning: {unlikely}", file=sys.stderr)
-    options = {"up": args.up, "origin": args.origin, "extend_range": args.extend_range, "texture": args.texture, "material": args.material}
-    for path in export_run(run, args.format, out=args.out, scale=scale, **options):
-        print(path)
-    return 0
+        _warn(unlikely)
+    return scale
 
 
 def _check(folder: Path) -> int:

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Callable, Optional
 
 import numpy as np
+import torch
 
 from p2gs.export.clearance import clear_links
 from p2gs.export.convex import Piece, decompose
+from p2gs.export.inertia import Inertia, effective_inertia, enclosed, inertia_of, joint_load
 from p2gs.export.mesh import read_meshes, write_meshes
+from p2gs.export.pose import pose
+from p2gs.export.reach import extend_links
+from p2gs.export.simplify import simplify
 from p2gs.export.texture import Texture
-from p2gs.export.tsdf import Mesh, vertex_normals
+from p2gs.export.tsdf import Mesh
 from p2gs.export.twin_json import load_twin
-from p2gs.export.unique_rows import unique_rows
-from p2gs.models.joint_range import extend_ranges
-from p2gs.types import Joint, UserError
+from p2gs.ops.sh import rotate_sh
+from p2gs.ops.so3 import matrix_to_quat, quat_multiply
+from p2gs.types import GaussianTensors, Joint, UserError
 
 DENSITY = 300.0  # kg / m^3 of the convex pieces: chipboard furniture with some air in it
 DENSITIES = {  # kg / m^3 of the collision pieces, which fill a shell's hollow walls: solid materials weigh more than parts made of them
@@ -30,7 +36,8 @@ DENSITIES = {  # kg / m^3 of the collision pieces, which fill a shell's hollow w
 LIKELY_SIZE = (0.05, 3.0)  # m, longest side: a stapler to a wardrobe
 MAX_FACES = 40_000  # a part's visual mesh; simulators refuse meshes of several hundred thousand
 HOLD = 0.02  # friction of a joint, in the weight that hangs on it: holds where the axis leans by a degree, as found axes do
-GRAVITY = 9.81  # m / s^2
+LIFT = 3.0  # effort limit of a joint in the weight that hangs on it: a hand or a motor that opens it has that much to spare
+QUICK = 0.25  # seconds in which a joint may run through its range: a door that is thrown shut; sets the velocity limit
 SETTLE = 0.5  # seconds in which an undriven joint loses most of its speed; sets the default damping
 UPS = ("z", "y", "x")
 ORIGINS = ("keep", "center", "bottom")
@@ -50,21 +57,20 @@ class Placement:
     def vector(self, v: np.ndarray) -> np.ndarray:
         return np.asarray(v, dtype=np.float64) @ self.rotation.T
 
-
-@dataclass(frozen=True)
-class Inertia:
-    """mass [kg], center of mass [3] and inertia about it [3, 3], in the link's frame."""
-
-    mass: float
-    center: np.ndarray
-    matrix: np.ndarray
+    def gaussians(self, g: GaussianTensors, at: np.ndarray) -> GaussianTensors:
+        """Gaussians with their centres relative to ``at`` [3] of the target."""
+        R = torch.from_numpy(self.rotation)
+        means = torch.from_numpy(self.points(g.means.double().numpy()) - at).float()
+        quats = quat_multiply(matrix_to_quat(R).expand(len(g), 4), g.quats.double()).float()
+        sh = rotate_sh(g.sh, R.to(g.sh)) if g.sh.shape[1] > 1 else g.sh
+        return GaussianTensors(means, quats, g.log_scales + math.log(self.scale), g.opacity_logits, sh)
 
 
 @dataclass(frozen=True)
 class Hinge:
     """A joint in SI units of the target. axis [3] unit, origin [3].  lower, upper, motion: radians or metres, 0 = start state.
 
-    damping: N m s / rad or N s / m.  friction: N m or N that holds the joint while it does not move.
+    damping: N m s / rad or N s / m.  load: N m or N, of the part's weight where it pulls most.
     """
 
     type: str
@@ -74,7 +80,22 @@ class Hinge:
     upper: float
     motion: float
     damping: float
-    friction: float = 0.0
+    load: float = 0.0
+
+    @property
+    def friction(self) -> float:
+        """N m or N that holds the joint while it does not move."""
+        return HOLD * self.load
+
+    @property
+    def velocity(self) -> float:
+        """Limit, rad/s or m/s."""
+        return max(self.upper - self.lower, 1e-3) / QUICK
+
+    @property
+    def effort(self) -> float:
+        """Limit, N m or N: lifts the part, and drives it against its damping at the highest speed."""
+        return LIFT * self.load + self.damping * self.velocity
 
 
 @dataclass(frozen=True)
@@ -89,6 +110,9 @@ class Link:
     joint: Optional[Hinge]
     colour: tuple[float, float, float]
     texture: Optional[Texture] = None
+    label: str = ""  # what it is, of ``naming``: door, drawer; empty where names are those of the twin
+    closed: bool = True  # whether the surface encloses a volume
+    splats: Optional[GaussianTensors] = None  # the part's Gaussians, in the link's frame like the rest
 
     @property
     def origin(self) -> np.ndarray:
@@ -98,13 +122,16 @@ class Link:
 @dataclass(frozen=True)
 class Asset:
     """links[0] is the static base.  blocking: (moving link, other link) that run into each other in one of the other's recorded states, as
-    a door before a drawer does.  lost: share of a link's collision volume that was trimmed to give joints room, by name."""
+    a door before a drawer does.  lost: share of a link's collision volume that was trimmed to give joints room, by name.  fixed: whether
+    the base stands fast in the world or may fall over; None: as each format has it.  material: one of ``DENSITIES``."""
 
     name: str
     links: list[Link]
     up: str
     blocking: list[tuple[str, str]] = field(default_factory=list)
     lost: dict[str, float] = field(default_factory=dict)
+    fixed: Optional[bool] = None
+    material: str = "chipboard"
 
     @property
     def moving(self) -> list[Link]:
@@ -121,13 +148,15 @@ def load_asset(
     solid: bool = True,
     extend_range: bool = False,
     texture: Optional[Callable[[int, Mesh], Texture]] = None,
+    splats: bool = False,
 ) -> Asset:
     """Read a run (its meshes are made if they are not there) into the target's conventions.
 
     scale: metres per input unit.  up: axis of the target that points up; the input's is z.  origin: ``keep`` the input's,
     ``center`` of the object's box, or the middle of its ``bottom``.  solid: with collision pieces and inertia; without, for looking
-    at only, it takes no time.  extend_range: joint limits beyond the observed motion, until parts touch.  texture: makes one of a part's id
-    and mesh (``texture.Baker``).  Raises UserError for other values or a run without a twin.
+    at only, it takes no time.  extend_range: joint limits beyond the observed motion, until pieces touch (only where solid).  texture:
+    makes one of a part's id and mesh (``texture.Baker``).  splats: with each part's Gaussians.  Raises UserError for other values or a run
+    without a twin.
     """
     if up not in UPS:
         raise UserError(f"--up is '{up}', expected one of {', '.join(UPS)}")
@@ -137,8 +166,6 @@ def load_asset(
         raise UserError(f"--scale is {scale:g}, but metres per input unit must be positive")
     run_dir = Path(run_dir)
     obj = load_twin(run_dir)
-    if extend_range:
-        obj.parts = extend_ranges(obj)
     meshes = read_meshes(run_dir)
     if meshes is None:
         write_meshes(run_dir)
@@ -148,11 +175,14 @@ def load_asset(
     if not pairs or pairs[0][0].joint is not None:
         raise UserError(f"{run_dir}: the static part has no surface, so there is no base to hang joints on")
     links = [make_link(part.id, part.joint, mesh, place, density, max_faces, solid, texture) for part, mesh in pairs]
+    if splats:
+        start = pose(obj, 0.0)
+        links = [replace(x, splats=place.gaussians(start[obj.part_ids == x.part], x.origin)) for x in links]
     name = run_dir.resolve().name
     if not solid:
         return Asset(name, links, up)
     cleared = clear_links(links)
-    return Asset(name, cleared.links, up, cleared.blocking, cleared.lost)
+    return Asset(name, extend_links(cleared.links) if extend_range else cleared.links, up, cleared.blocking, cleared.lost)
 
 
 def start_box(run_dir: Path | str) -> np.ndarray:
@@ -196,7 +226,10 @@ def make_link(
     world = simplify(mesh, max_faces)
     visual = Mesh(place.points(world.vertices) - at, world.faces, world.colours)
     pieces = decompose(place.points(mesh.vertices) - at) if solid else []
-    inertia = inertia_of(pieces, density) if solid else Inertia(0.0, np.zeros(3), np.zeros((3, 3)))
+    inertia, closed = Inertia(0.0, np.zeros(3), np.zeros((3, 3))), True
+    if solid:
+        inside = enclosed(place.points(mesh.vertices) - at, mesh.faces)
+        inertia, closed = inertia_of(pieces if inside is None else [inside], density), inside is not None
     hinge = None
     if joint is not None:
         axis = place.vector(joint.axis.numpy())
@@ -204,38 +237,19 @@ def make_link(
         unit = np.pi / 180 if joint.type == "revolute" else place.scale
         lower, upper = sorted(float(v) * unit for v in joint.limits)
         resistance = effective_inertia(inertia, axis) if joint.type == "revolute" else inertia.mass
-        friction = joint_friction(inertia, axis, joint.type)
-        hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE, friction)
+        load = joint_load(inertia, axis, joint.type)
+        hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE, load)
     name = "base" if joint is None else f"part_{part}"
     colour = tuple(float(c) for c in mesh.colours.mean(0) / 255)
-    return Link(name, part, visual, pieces, inertia, hinge, colour, texture(part, world) if texture else None)
+    return Link(name, part, visual, pieces, inertia, hinge, colour, texture(part, world) if texture else None, closed=closed)
 
 
-def inertia_of(pieces: list[Piece], density: float) -> Inertia:
-    """Mass properties of solid convex pieces, taken as disjoint."""
-    import trimesh
-
-    props = [trimesh.Trimesh(p.vertices, p.faces, process=False).mass_properties for p in pieces]
-    masses = np.array([max(float(p["volume"]), 1e-12) * density for p in props])
-    centers = np.array([p["center_mass"] for p in props])
-    center = (masses[:, None] * centers).sum(0) / masses.sum()
-    total = np.zeros((3, 3))
-    for p, m, c in zip(props, masses, centers, strict=True):
-        d = c - center
-        total += np.asarray(p["inertia"]) * density + m * ((d @ d) * np.eye(3) - np.outer(d, d))
-    return Inertia(float(masses.sum()), center, (total + total.T) / 2)
-
-
-def joint_friction(inertia: Inertia, axis: np.ndarray, kind: str) -> float:
-    """``HOLD`` of the part's weight; on a hinge times the distance of its centre of mass from the axis. N or N m."""
-    arm = 1.0 if kind == "prismatic" else float(np.linalg.norm(np.cross(axis, inertia.center)))
-    return HOLD * GRAVITY * inertia.mass * arm
-
-
-def effective_inertia(inertia: Inertia, axis: np.ndarray) -> float:
-    """About a unit axis through the link's origin, kg m^2."""
-    arm = np.cross(axis, inertia.center)
-    return float(axis @ inertia.matrix @ axis + inertia.mass * arm @ arm)
+def open_note(asset: Asset) -> Optional[str]:
+    """A sentence where surfaces enclose no volume, so that masses are guesses by the collision pieces."""
+    names = [link.name for link in asset.links if not link.closed]
+    if not names:
+        return None
+    return f"the mesh of {', '.join(names)} is open where no photograph looked: mass and inertia go by the collision pieces, not by volume"
 
 
 def joint_motion(hinge: Hinge, value: float) -> np.ndarray:
@@ -249,38 +263,3 @@ def joint_motion(hinge: Hinge, value: float) -> np.ndarray:
     T[:3, :3] += np.sin(value) * K + (1 - np.cos(value)) * K @ K
     T[:3, 3] = hinge.origin - T[:3, :3] @ hinge.origin
     return T
-
-
-def simplify(mesh: Mesh, max_faces: int) -> Mesh:
-    """At most about ``max_faces`` triangles: vertices of a grid cell become one, its cells as large as need be."""
-    if len(mesh.faces) <= max_faces:
-        return mesh
-    corner = mesh.vertices[mesh.faces]
-    area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum()
-    cell = np.sqrt(area / max_faces) * 1.2
-    while True:
-        out = cluster(mesh, cell)
-        if len(out.faces) <= max_faces:
-            return out
-        cell *= 1.15
-
-
-def cluster(mesh: Mesh, cell: float) -> Mesh:
-    """Vertices merged by cubic cell (mean position and colour); triangles that collapse or double go.
-
-    Vertices that look in different directions stay apart, so that the two sides of a thin wall do not become one.
-    """
-    normal = vertex_normals(mesh.vertices, mesh.faces)
-    rows = np.arange(len(normal))
-    side = np.abs(normal).argmax(1)
-    side = 2 * side + (normal[rows, side] > 0)
-    key = np.c_[np.floor((mesh.vertices - mesh.vertices.min(0)) / cell).astype(np.int64), side]
-    _, label = unique_rows(key)
-    count = np.bincount(label).astype(float)
-    vertices = np.stack([np.bincount(label, mesh.vertices[:, i]) for i in range(3)], 1) / count[:, None]
-    colours = np.stack([np.bincount(label, mesh.colours[:, i].astype(float)) for i in range(3)], 1) / count[:, None]
-    faces = label[mesh.faces]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    faces = faces[unique_rows(np.sort(faces, 1))[0]]
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return Mesh(vertices[used], renumbered.reshape(-1, 3), colours[used].round().astype(np.uint8))

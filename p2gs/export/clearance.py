@@ -48,7 +48,7 @@ def clear_links(links: list["Link"]) -> Cleared:
     in both recorded states and over the range while the other one is in a recorded state that leaves room (at least one does)."""
     from p2gs.export.asset import joint_motion
 
-    bodies = [_body(link) for link in links]
+    bodies = [body_of(link) for link in links]
     solid = [b for b in bodies if b.pieces]
     if len(solid) < 2:
         return Cleared(links, {b.name: 0.0 for b in bodies}, [])
@@ -82,7 +82,8 @@ def clear_links(links: list["Link"]) -> Cleared:
     return Cleared(out, lost, blocking)
 
 
-def _body(link: "Link") -> Body:
+def body_of(link: "Link") -> Body:
+    """The link's pieces in world axes at the start."""
     pieces = [_moved(p, link.origin) for p in link.collision]
     return Body(link.name, pieces, link.joint, sum(p.volume for p in pieces))
 
@@ -133,6 +134,15 @@ def _depth(a: Body, b: Body, values: np.ndarray, other: np.ndarray, gap: float) 
         for i, j in _close(a, b, poses, other, 0.0):
             deepest = max(deepest, separation(_hull_of(a.pieces[i], poses), _hull_of(b.pieces[j], (other,)))[0])
     return deepest
+
+
+def touches(a: Body, b: Body, values: np.ndarray, other: np.ndarray, margin: float) -> bool:
+    """Whether a piece of ``a``, moved through joint values [n], comes within ``margin`` of one of ``b`` at ``other`` [4, 4]."""
+    for poses in _poses(a, values):
+        for i, j in _close(a, b, poses, other, margin):
+            if separation(_hull_of(a.pieces[i], poses), _hull_of(b.pieces[j], (other,)))[0] > -margin:
+                return True
+    return False
 
 
 def _hull_of(piece: Piece, poses: tuple[np.ndarray, ...]) -> Piece:

@@ -208,30 +208,36 @@ class PyBullet:
         return np.array([s[0] for s in states]), np.array([s[1] for s in states])
 
 
+def load_in_sapien(path: Path):
+    """SAPIEN's scene, its PhysX on the CPU and the articulation of a URDF, its root fixed, without what it shows: drawing needs a Vulkan
+    device."""
+    import tempfile
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that there is no Vulkan
+        import sapien
+
+    system = sapien.physx.PhysxCpuSystem()
+    scene = sapien.Scene([system])
+    scene.set_timestep(STEP)
+    tree = ET.parse(path)
+    for link in tree.getroot().findall("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf", dir=path.parent) as file:
+        file.write(ET.tostring(tree.getroot(), encoding="unicode"))
+        file.flush()
+        loader = scene.create_urdf_loader()
+        loader.fix_root_link = True
+        return scene, system, loader.load(file.name)
+
+
 class Sapien:
-    """twin.urdf in SAPIEN (PhysX on the CPU), without what it shows: drawing needs a Vulkan device."""
+    """twin.urdf in SAPIEN."""
 
     def __init__(self, folder: Path):
-        import tempfile
-        import warnings
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that there is no Vulkan
-            import sapien
-
-        self.system = sapien.physx.PhysxCpuSystem()
-        self.scene = sapien.Scene([self.system])
-        self.scene.set_timestep(STEP)
-        tree = ET.parse(folder / "twin.urdf")
-        for link in tree.getroot().findall("link"):
-            for visual in link.findall("visual"):
-                link.remove(visual)
-        with tempfile.NamedTemporaryFile("w", suffix=".urdf", dir=folder) as file:
-            file.write(ET.tostring(tree.getroot(), encoding="unicode"))
-            file.flush()
-            loader = self.scene.create_urdf_loader()
-            loader.fix_root_link = True
-            self.twin = loader.load(file.name)
+        self.scene, self.system, self.twin = load_in_sapien(folder / "twin.urdf")
         self.names = [j.name for j in self.twin.active_joints]
 
     def gravity(self, on: bool) -> None:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Callable, Iterable, Optional
+from typing import Callable, Iterable, Mapping, Optional
 
-from p2gs.export.asset import DENSITIES, Asset, load_asset
+from p2gs.export.asset import DENSITIES, Asset, load_asset, open_note
 from p2gs.export.assets_dir import write_obj
+from p2gs.export.metadata import read_meta
+from p2gs.export.naming import with_names
+from p2gs.export.profiles import PROFILE_UP, PROFILES, Context
 from p2gs.export.texture import Baker
 from p2gs.registry import Registry
 from p2gs.types import UserError
 
 Exporter = Callable[[Asset, Path], Path]
 EXPORTERS: Registry[Exporter] = Registry("export format")
-DEFAULT_UP = {"glb": "y"}  # glTF's rule; the others take the input's z
-UNTEXTURED = {"ply"}
-FOR_LOOKS = {"glb", "ply", "obj"}  # hold no collision pieces or masses, which take most of an export's time
+DEFAULT_UP = {"glb": "y", "splats": "y"}  # glTF's rule; the others take the input's z
+UNTEXTURED = {"ply", "splats"}
+FOR_LOOKS = {"glb", "ply", "obj", "splats"}  # hold no collision pieces or masses, which take most of an export's time
 
 
 @EXPORTERS.register("urdf")
@@ -50,6 +54,14 @@ def usd(asset: Asset, out: Path) -> Path:
     return write_usd(asset, out)
 
 
+@EXPORTERS.register("splats")
+def splats(asset: Asset, out: Path) -> Path:
+    """splats.glb: the Gaussians, animated."""
+    from p2gs.export.splats_gltf import write_splats
+
+    return write_splats(asset, out)
+
+
 @EXPORTERS.register("ply")
 def ply(asset: Asset, out: Path) -> Path:
     """parts/<link>.ply at the start state, vertex colours."""
@@ -75,44 +87,116 @@ def obj(asset: Asset, out: Path) -> Path:
     return folder
 
 
+@dataclass(frozen=True)
+class ExportOptions:
+    """scale: metres per input unit.  up: z, y or x, by default what the format expects.  origin: keep, center or bottom.
+    extend_range: joint limits go on beyond the observed motion until parts touch (twin.json keeps what was observed).
+    texture: parts get baked textures in every format but PLY and splats, which know none.
+    material: one of ``DENSITIES``, which the masses go by.
+    names: links are called by what they are, which geometry tells but for those given here by part (``naming.with_names``).
+    fixed: whether the base stands fast in the world (URDF: on a link ``world``); None: as the format has it.
+    splats: USD also has each part's Gaussians.
+    """
+
+    scale: float = 1.0
+    up: Optional[str] = None
+    origin: str = "keep"
+    extend_range: bool = False
+    texture: bool = False
+    material: str = "chipboard"
+    names: Optional[Mapping[str, str]] = None
+    fixed: Optional[bool] = None
+    splats: bool = False
+
+    def __post_init__(self) -> None:
+        if self.material not in DENSITIES:
+            raise UserError(f"--material is '{self.material}', expected one of {', '.join(DENSITIES)}")
+
+    def load(self, run_dir: Path | str, up: str, solid: bool, splats: bool, baker: Optional[Baker]) -> Asset:
+        """The run's asset under these options, as far as the formats need it."""
+        made = {"solid": solid, "splats": splats, "extend_range": self.extend_range, "texture": baker}
+        asset = load_asset(run_dir, self.scale, up, self.origin, DENSITIES[self.material], **made)
+        asset = replace(asset, fixed=self.fixed, material=self.material)
+        return asset if self.names is None else with_names(asset, self.names)
+
+
+def own_folder(run_dir: Path | str, out: Optional[Path | str], option: str) -> Path:
+    """``out``, which must be another folder than the run's: other programs read its files by the names base and part_1."""
+    if out is None or Path(out).resolve() == Path(run_dir).resolve():
+        raise UserError(f"{option}: {run_dir} keeps the names base and part_1 that other programs read; give another folder with --out")
+    return Path(out)
+
+
+def without_splats(asset: Asset) -> Asset:
+    """The asset for formats that are not to have them."""
+    return replace(asset, links=[replace(link, splats=None) for link in asset.links])
+
+
 def export_run(
     run_dir: Path | str,
     formats: Iterable[str] = ("all",),
     out: Optional[Path | str] = None,
-    scale: float = 1.0,
-    up: Optional[str] = None,
-    origin: str = "keep",
-    extend_range: bool = False,
-    texture: bool = False,
-    material: str = "chipboard",
+    note: Callable[[str], None] = lambda text: None,
+    **options,
 ) -> list[Path]:
     """Write a finished run in the named formats (``all``: every one) into ``out`` (default the run's folder); returns the files.
 
-    scale: metres per input unit.  up: z, y or x, by default what the format expects.  origin: keep, center or bottom.
-    extend_range: joint limits go on beyond the observed motion until parts touch (twin.json keeps what was observed).
-    texture: parts get baked textures in every format but PLY, which knows none.
-    material: one of ``DENSITIES``, which the masses go by.
-    Raises UserError for an unknown format or material, with the nearest name, and for textures that no named format holds.
+    note: told what a user should know of the result.  options: fields of ``ExportOptions``; with ``names``, ``out`` must be another folder
+    than the run's. Raises UserError for an unknown format or material, with the nearest name, and for textures that no named format holds.
     """
-    names = list(dict.fromkeys(n for f in formats for n in (EXPORTERS if f == "all" else [f])))
-    if not names:
+    kinds = list(dict.fromkeys(n for f in formats for n in (EXPORTERS if f == "all" else [f])))
+    if not kinds:
         raise UserError(f"no export format given; known: {', '.join(EXPORTERS)}")
-    writers = {name: EXPORTERS[name] for name in names}
-    if texture and UNTEXTURED.issuperset(names):
-        raise UserError(f"--texture: {', '.join(names)} holds vertex colours and no textures; name another format as well, or leave it out")
+    writers = {name: EXPORTERS[name] for name in kinds}
+    chosen = ExportOptions(**options)
+    if chosen.texture and UNTEXTURED.issuperset(kinds):
+        raise UserError(f"--texture: {', '.join(kinds)} holds vertex colours and no textures; name another format as well, or leave it out")
+    if chosen.names is not None:
+        out = own_folder(run_dir, out, "--name")
     out = Path(out) if out is not None else Path(run_dir)
     out.mkdir(parents=True, exist_ok=True)
-    if material not in DENSITIES:
-        raise UserError(f"--material is '{material}', expected one of {', '.join(DENSITIES)}")
-    axes = {name: up or DEFAULT_UP.get(name, "z") for name in writers}
-    solid = {axes[name] for name in writers if name not in FOR_LOOKS}
+    axes = {name: chosen.up or DEFAULT_UP.get(name, "z") for name in writers}
+    solid = {axes[name] for name in writers if name not in FOR_LOOKS or chosen.extend_range}
     assets: dict[str, Asset] = {}
-    baker = Baker(run_dir) if texture else None
+    baker = Baker(run_dir) if chosen.texture else None
     written = []
     for name, write in writers.items():
         axis = axes[name]
         if axis not in assets:
-            options = {"solid": axis in solid, "extend_range": extend_range, "texture": baker}
-            assets[axis] = load_asset(run_dir, scale, axis, origin, DENSITIES[material], **options)
-        written.append(write(assets[axis], out))
+            gaussians = chosen.splats or axes.get("splats") == axis
+            assets[axis] = chosen.load(run_dir, axis, axis in solid, gaussians, baker)
+        asset = assets[axis] if chosen.splats or name == "splats" else without_splats(assets[axis])
+        written.append(write(asset, out))
+    told = next((text for text in map(open_note, assets.values()) if text), None)
+    if told:
+        note(told)
     return written
+
+
+def export_profile(
+    run_dir: Path | str,
+    profile: str,
+    out: Optional[Path | str],
+    meta: Optional[Path | str] = None,
+    note: Callable[[str], None] = lambda text: None,
+    **options,
+) -> list[Path]:
+    """Write a finished run as one simulator takes it, named and textured, into ``out``, another folder than the run's; returns the files.
+
+    meta: a file of ``metadata.read_meta``.  note, options: as for ``export_run``; a profile sets ``up`` and ``texture`` itself. Raises
+    UserError for an unknown profile, with the nearest name.
+    """
+    write = PROFILES[profile]
+    out = own_folder(run_dir, out, "--profile")
+    own = PROFILE_UP.get(profile, "z")
+    if options.get("up") not in (None, own):
+        raise UserError(f"--up is '{options['up']}', but files of the profile {profile} stand on {own}")
+    chosen = replace(ExportOptions(**options), up=own, texture=True)
+    chosen = replace(chosen, names=chosen.names or {})
+    context = Context(Path(run_dir), read_meta(meta) if meta is not None else {})
+    out.mkdir(parents=True, exist_ok=True)
+    asset = chosen.load(run_dir, own, True, chosen.splats, Baker(run_dir))
+    told = open_note(asset)
+    if told:
+        note(told)
+    return write(asset, out, context)

@@ -59,11 +59,31 @@ def write_glb(asset: Asset, out: Path) -> Path:
 def glb_bytes(asset: Asset) -> bytes:
     """The file's content."""
     buffer = Buffer()
+    meshes = [_mesh(buffer, link) for link in asset.links]
+    textured = [link for link in asset.links if link.texture is not None]
+    document: dict = {}
+    if textured:  # read between texels, but from no smaller copies, in which neighbours run together
+        images = [{"bufferView": buffer.add_bytes(link.texture.png()), "mimeType": "image/png", "name": link.name} for link in textured]
+        document |= {"images": images, "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR}]}
+        document["textures"] = [{"source": i, "sampler": 0} for i in range(len(images))]
+    number = {link.name: i for i, link in enumerate(textured)}
+    for mesh in meshes:
+        mesh["primitives"][0]["material"] = number.get(mesh["name"], len(textured))
+    document["materials"] = [_material(link.name, i) for i, link in enumerate(textured)]
+    if len(textured) < len(asset.links):
+        document["materials"].append(_material("scan"))
+    return animated_glb(asset, buffer, meshes, document)
+
+
+def animated_glb(asset: Asset, buffer: Buffer, meshes: list[dict], document: dict) -> bytes:
+    """A file of one node a part, with the mesh of its name where there is one, that opens and shuts every joint.
+
+    document: what else it has; arrays are in ``buffer``.
+    """
     nodes: list[dict] = [{"name": asset.name, "children": list(range(1, len(asset.links) + 1))}]
-    meshes = []
-    for i, link in enumerate(asset.links):
-        meshes.append(_mesh(buffer, link))
-        nodes.append({"name": link.name, "mesh": i, "translation": link.origin.tolist()} | _extras(link))
+    number = {mesh["name"]: {"mesh": i} for i, mesh in enumerate(meshes)}
+    for link in asset.links:
+        nodes.append({"name": link.name, "translation": link.origin.tolist()} | number.get(link.name, {}) | _extras(link))
     samplers, channels = [], []
     times = np.linspace(0, SECONDS, 9, dtype=np.float32)
     clock = buffer.add(times, "SCALAR", FLOAT) if asset.moving else -1
@@ -72,28 +92,16 @@ def glb_bytes(asset: Asset) -> bytes:
             keys, kind, path = _keyframes(link.joint, 1 - np.abs(1 - 2 * times / SECONDS))
             samplers.append({"input": clock, "output": buffer.add(keys, kind, FLOAT), "interpolation": "LINEAR"})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": i + 1, "path": path}})
-    textured = [link for link in asset.links if link.texture is not None]
-    images = [{"bufferView": buffer.add_bytes(link.texture.png()), "mimeType": "image/png", "name": link.name} for link in textured]
-    number = {link.name: i for i, link in enumerate(textured)}
-    for mesh in meshes:
-        mesh["primitives"][0]["material"] = number.get(mesh["name"], len(textured))
-    materials = [_material(link.name, i) for i, link in enumerate(textured)]
-    if len(textured) < len(asset.links):
-        materials.append(_material("scan"))
-    document = {
+    document = document | {
         "asset": {"version": "2.0", "generator": "p2gs"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": nodes,
         "meshes": meshes,
-        "materials": materials,
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": len(buffer.data)}],
     }
-    if images:  # read between texels, but from no smaller copies, in which neighbours run together
-        document |= {"images": images, "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR}]}
-        document["textures"] = [{"source": i, "sampler": 0} for i in range(len(images))]
     if channels:
         document["animations"] = [{"name": "open_and_shut", "samplers": samplers, "channels": channels}]
     text = json.dumps(document, separators=(",", ":")).encode()
@@ -120,10 +128,7 @@ def _mesh(buffer: Buffer, link: Link) -> dict:
         "NORMAL": buffer.add(normals[rows].astype(np.float32), "VEC3", FLOAT, ARRAY_BUFFER),
     }
     if link.texture is None:
-        # glTF takes vertex colours as linear light, pictures are sRGB
-        srgb = v.colours / 255
-        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-        rgba = (np.c_[linear, np.ones(len(linear))] * 255).round().astype(np.uint8)
+        rgba = (np.c_[linear_light(v.colours / 255), np.ones(len(v.colours))] * 255).round().astype(np.uint8)
         attributes["COLOR_0"] = buffer.add(rgba, "VEC4", UBYTE, ARRAY_BUFFER, normalized=True)
     else:
         uv = link.texture.uv.reshape(-1, 2) * [1, -1] + [0, 1]  # glTF counts from the upper edge
@@ -132,12 +137,18 @@ def _mesh(buffer: Buffer, link: Link) -> dict:
     return {"name": link.name, "primitives": [{"attributes": attributes, "indices": indices}]}
 
 
+def linear_light(srgb: np.ndarray) -> np.ndarray:
+    """Colours in 0..1 as pictures have them, in the linear light that glTF's vertex colours are."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
 def _extras(link: Link) -> dict:
-    h, colour = link.joint, list(part_colour(link.part))
+    h = link.joint
+    extras: dict = {"colour": list(part_colour(link.part))} | ({"label": link.label} if link.label else {})
     if h is None:
-        return {"extras": {"colour": colour}}
+        return {"extras": extras}
     joint = {"type": h.type, "axis": h.axis.tolist(), "origin": h.origin.tolist(), "motion": h.motion, "limits": [h.lower, h.upper]}
-    return {"extras": {"colour": colour, "joint": joint}}
+    return {"extras": extras | {"joint": joint}}
 
 
 def _keyframes(hinge: Hinge, shares: np.ndarray) -> tuple[np.ndarray, str, str]:

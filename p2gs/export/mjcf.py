@@ -5,15 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from p2gs.export.asset import Asset, Link, effective_inertia
+from p2gs.export.asset import Asset, Link
 from p2gs.export.assets_dir import FOLDER, collision_name, texture_name, visual_name, write_assets
+from p2gs.export.inertia import effective_inertia
 from p2gs.export.urdf import number, numbers
 
 GRAVITY = {"z": (0, 0, -9.81), "y": (0, -9.81, 0), "x": (-9.81, 0, 0)}
 
 
 def write_mjcf(asset: Asset, out: Path) -> Path:
-    """OUT/twin.xml and OUT/assets. The base stands fixed in the world; joint names are those of the URDF."""
+    """OUT/twin.xml and OUT/assets. The base stands fixed in the world unless it is to float; joint names are those of the URDF."""
     write_assets(asset, out)
     root = ET.Element("mujoco", model=asset.name)
     ET.SubElement(root, "compiler", angle="radian", meshdir=FOLDER, texturedir=FOLDER, autolimits="true")
@@ -31,10 +32,13 @@ def write_mjcf(asset: Asset, out: Path) -> Path:
         for i in range(len(link.collision)):
             ET.SubElement(meshes, "mesh", name=f"{link.name}_{i}", file=collision_name(link, i), inertia="convex")
     base = _body(world, asset.links[0])
+    if asset.fixed is False:
+        base.insert(0, ET.Element("freejoint", name="floating_base"))
     actuator = ET.SubElement(root, "actuator")
     for link in asset.moving:
         _body(base, link)
-        ET.SubElement(actuator, "motor", name=f"motor_{link.part}", joint=f"joint_{link.part}", gear="1")
+        reach = numbers((-link.joint.effort, link.joint.effort))
+        ET.SubElement(actuator, "motor", name=f"motor_{link.part}", joint=f"joint_{link.part}", gear="1", ctrlrange=reach)
     path = out / "twin.xml"
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n")

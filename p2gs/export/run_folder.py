@@ -39,7 +39,7 @@ def write_twin(obj: ArticulatedObject, run_dir: Path | str, scene: TwoStateScene
 
 def remove_derived(run_dir: Path) -> None:
     """Remove what was made of an earlier twin: its meshes, files for simulators, report and scores would be taken for the new one's."""
-    names = ("meshes", "assets", "parts", "report.html", "metrics.json", "slots.json")
+    names = ("meshes", "assets", "parts", "splats.glb", "report.html", "metrics.json", "slots.json")
     for path in (*run_dir.glob("twin.*"), *(run_dir / name for name in names)):
         if path.is_dir():
             shutil.rmtree(path)

@@ -6,7 +6,6 @@ saw it, its triangle's vertices' colours.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +26,7 @@ TILE = 8  # texels along a tile; the short edges of a triangle get TILE - 3
 
 @dataclass(frozen=True)
 class Texture:
-    """uv [F, 3, 2]: of each triangle's corners, from the picture's lower left corner, in 0..1.  image [S, S, 3] uint8, upper row first."""
+    """uv [F, 3, 2]: of each triangle's corners, from the picture's lower left corner, in 0..1.  image [H, W, 3] uint8, upper row first."""
 
     uv: np.ndarray
     image: np.ndarray
@@ -42,26 +41,30 @@ class Texture:
         return cv2.imencode(".png", np.ascontiguousarray(self.image[..., ::-1]))[1].tobytes()
 
 
-def tiles(count: int) -> tuple[int, np.ndarray]:
-    """Side of the picture [texels] of ``count`` triangles, and column and row of the first texel of each one's tile, [count, 2]."""
-    across = max(1, math.ceil(math.sqrt((count + 1) // 2)))
+def tiles(count: int) -> tuple[tuple[int, int], np.ndarray]:
+    """Width and height of the picture [texels] of ``count`` triangles, and column and row of the first texel of each one's tile [count, 2].
+
+    Both sides are powers of two, as older graphics hardware and some importers demand, the width once or twice the height.
+    """
+    doublings = max((count + 1) // 2 - 1, 0).bit_length()
+    across = 2 ** ((doublings + 1) // 2)
     tile = np.arange(count) // 2
-    return across * TILE, TILE * np.stack([tile % across, tile // across], 1)
+    return (across * TILE, 2 ** (doublings // 2) * TILE), TILE * np.stack([tile % across, tile // across], 1)
 
 
-def layout(count: int) -> tuple[int, np.ndarray]:
-    """Side of the picture [texels] and uv of the corners of ``count`` triangles in it, [count, 3, 2] (``Texture``).
+def layout(count: int) -> tuple[tuple[int, int], np.ndarray]:
+    """Width and height of the picture [texels] and uv of the corners of ``count`` triangles in it, [count, 3, 2] (``Texture``).
 
     Corners lie on the centres of texels, and between the two triangles of a tile is room for both, so that no colour of a neighbour shows
     where a picture is read between texels.
     """
-    side, first = tiles(count)
+    size, first = tiles(count)
     lower = np.array([[0, 0], [TILE - 3, 0], [0, TILE - 3]])
     upper = np.array([[TILE - 1, TILE - 1], [2, TILE - 1], [TILE - 1, 2]])
     at = np.where((np.arange(count) % 2 == 0)[:, None, None], lower, upper)
-    uv = (first[:, None] + at + 0.5) / side
+    uv = (first[:, None] + at + 0.5) / size
     uv[..., 1] = 1 - uv[..., 1]
-    return side, uv
+    return size, uv
 
 
 def texels(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -85,7 +88,7 @@ def texels(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def bake(mesh: Mesh, seen: Sightings, part: int) -> Texture:
     """The texture of a part's mesh in the start state, from the views of both. part: place in the twin's parts."""
-    side, uv = layout(len(mesh.faces))
+    (width, height), uv = layout(len(mesh.faces))
     triangle, weights, place = texels(len(mesh.faces))
     points = (mesh.vertices[mesh.faces[triangle]] * weights[..., None]).sum(1)
     colour = (mesh.colours[mesh.faces[triangle]] * weights[..., None]).sum(1) / 255
@@ -94,7 +97,7 @@ def bake(mesh: Mesh, seen: Sightings, part: int) -> Texture:
     _, weight, tint = integrate(torch.from_numpy(points).float(), seen.views, matrices, part, *reach)
     told = (weight > 0).numpy()
     colour[told] = tint.numpy()[told]
-    image = np.zeros((side, side, 3), np.uint8)
+    image = np.zeros((height, width, 3), np.uint8)
     image[place[:, 1], place[:, 0]] = (colour.clip(0, 1) * 255).round()
     return Texture(uv, image)
 

@@ -1,45 +1,90 @@
-"""USD as text (.usda): meshes with vertex colours, rigid bodies with mass, and UsdPhysics joints with limits. Needs no library to write."""
+"""USD as text (.usda), written without a library: meshes with colours, rigid bodies, UsdPhysics joints with limits and damping."""
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
+from typing import Mapping, Optional, Sequence, Union
 
 import numpy as np
 
 from p2gs.export.asset import Asset, Hinge, Link
 from p2gs.export.assets_dir import texture_name
+from p2gs.export.splats_usd import splat_prim
 from p2gs.export.tsdf import vertex_normals
 from p2gs.types import UserError
 
 TEXTURES = "textures"  # folder beside the stage
+FRICTION = 0.6  # of surfaces on each other, as in MJCF: wood on wood
+Value = Union[str, int, float, Sequence[float], Mapping[str, "Value"]]  # of layer metadata
 
 
-def write_usd(asset: Asset, out: Path) -> Path:
-    """OUT/twin.usda, metres, up axis Y or Z as asked for. Raises UserError for x, which USD does not know as an up axis."""
+def write_usd(
+    asset: Asset, out: Path, name: str = "twin", data: Optional[Mapping[str, Value]] = None, labels: Sequence[tuple] = ()
+) -> Path:
+    """OUT/<name>.usda, metres, up axis Y or Z as asked for. Raises UserError for x, which USD does not know as an up axis.
+
+    Links that have splats get them as a prim each.  data: the layer's own metadata (customLayerData).  labels: (taxonomy, label) pairs of
+    the whole object.
+    """
     if asset.up == "x":
         raise UserError("--up is 'x', but a USD stage stands on y or z: give --up y or --up z")
+    schemas = ["PhysicsArticulationRootAPI", *(f"SemanticsLabelsAPI:{taxonomy}" for taxonomy, _ in labels)]
     lines = [
         "#usda 1.0",
         "(",
+        *(layer_data(data) if data else []),
         '    defaultPrim = "twin"',
         "    metersPerUnit = 1",
         "    kilogramsPerUnit = 1",
         f'    upAxis = "{asset.up.upper()}"',
         ")",
-        'def Xform "twin" (prepend apiSchemas = ["PhysicsArticulationRootAPI"])',
+        f'def Xform "twin" (prepend apiSchemas = {json.dumps(schemas)})',
         "{",
+        *(f"    token[] semantics:labels:{taxonomy} = [{json.dumps(label)}]" for taxonomy, label in labels),
+        *_contact(asset.material if asset.links[0].label else ""),
     ]
     for link in asset.links:
         lines += _link(link)
         if link.texture is not None:
             link.texture.save(_texture(out, link))
-            lines += _material(link)
-    lines += ['    def PhysicsFixedJoint "fix_base"', "    {", "        rel physics:body1 = </twin/base>", "    }"]
+            lines += _material(link, asset.material if link.label else "")
+    if asset.fixed is not False:
+        lines += ['    def PhysicsFixedJoint "fix_base"', "    {", f"        rel physics:body1 = </twin/{asset.links[0].name}>", "    }"]
     for link in asset.moving:
         lines += _joint(link, asset.links[0].name)
-    path = out / "twin.usda"
+    path = out / f"{name}.usda"
     path.write_text("\n".join([*lines, "}"]) + "\n")
     return path
+
+
+def layer_data(data: Mapping[str, Value], depth: int = 1, head: str = "customLayerData = {") -> list[str]:
+    """Lines of a dictionary in a layer's metadata: strings, whole numbers, floats, triples of floats, dictionaries of these."""
+    indent, lines = "    " * depth, []
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            lines += layer_data(value, depth + 1, f"dictionary {key} = {{")
+        elif isinstance(value, (str, bool)):
+            lines.append(f"{indent}    string {key} = {json.dumps(str(value), ensure_ascii=False)}")
+        elif isinstance(value, (int, float)):
+            lines.append(f"{indent}    {'int' if isinstance(value, int) else 'double'} {key} = {value!r}")
+        else:
+            lines.append(f"{indent}    float3 {key} = {_tuple(value)}")
+    return [indent + head, *lines, indent + "}"]
+
+
+def _contact(label: str) -> list[str]:
+    """The physics material of all collision pieces, labelled by what the object is made of, if it is labelled at all."""
+    schemas = ["PhysicsMaterialAPI", *(["SemanticsLabelsAPI:material"] if label else [])]
+    return [
+        f'    def Material "contact" (prepend apiSchemas = {json.dumps(schemas)})',
+        "    {",
+        *([f'        token[] semantics:labels:material = ["{label}"]'] if label else []),
+        f"        float physics:staticFriction = {FRICTION}",
+        f"        float physics:dynamicFriction = {FRICTION}",
+        "    }",
+    ]
 
 
 def _link(link: Link) -> list[str]:
@@ -59,17 +104,18 @@ def _link(link: Link) -> list[str]:
     if link.texture is not None:
         look += [f"texCoord2f[] primvars:st = {_array(link.texture.uv.reshape(-1, 2), 7)} (", '    interpolation = "faceVarying"', ")"]
         look += [f"rel material:binding = </twin/{link.name}_look>"]
-    schemas = "" if link.texture is None else ' (prepend apiSchemas = ["MaterialBindingAPI"])'
+    schemas = [] if link.texture is None else ["MaterialBindingAPI"]
+    if link.label:
+        schemas.append("SemanticsLabelsAPI:class")
+        look.append(f'token[] semantics:labels:class = ["{link.label}"]')
     body += _mesh("visual", visual.vertices, visual.faces, look, schemas)
     for i, piece in enumerate(link.collision):
         extra = ['uniform token physics:approximation = "convexHull"', 'uniform token purpose = "guide"']
-        body += _mesh(
-            f"collision_{i}",
-            piece.vertices,
-            piece.faces,
-            extra,
-            ' (prepend apiSchemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"])',
-        )
+        extra.append("rel material:binding:physics = </twin/contact>")
+        schemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI", "MaterialBindingAPI"]
+        body += _mesh(f"collision_{i}", piece.vertices, piece.faces, extra, schemas)
+    if link.splats is not None and len(link.splats):
+        body += splat_prim(link.splats, "        ")
     return [*body, "    }"]
 
 
@@ -79,11 +125,12 @@ def _texture(out: Path, link: Link) -> Path:
     return folder / texture_name(link)
 
 
-def _material(link: Link) -> list[str]:
+def _material(link: Link, label: str) -> list[str]:
     here = f"/twin/{link.name}_look"
     return [
-        f'    def Material "{link.name}_look"',
+        f'    def Material "{link.name}_look"' + (' (prepend apiSchemas = ["SemanticsLabelsAPI:material"])' if label else ""),
         "    {",
+        *([f'        token[] semantics:labels:material = ["{label}"]'] if label else []),
         f"        token outputs:surface.connect = <{here}/surface.outputs:surface>",
         '        def Shader "surface"',
         "        {",
@@ -110,10 +157,10 @@ def _material(link: Link) -> list[str]:
     ]
 
 
-def _mesh(name: str, vertices: np.ndarray, faces: np.ndarray, extra: list[str], schemas: str = "") -> list[str]:
+def _mesh(name: str, vertices: np.ndarray, faces: np.ndarray, extra: list[str], schemas: list[str]) -> list[str]:
     rows = [
         f"point3f[] points = {_array(vertices, 7)}",
-        f"float3[] extent = {_array(np.array([vertices.min(0), vertices.max(0)]), 9)}",
+        f"float3[] extent = {_array(np.array([vertices.min(0), vertices.max(0)]), 7)}",  # of the points as they are written
         f"normal3f[] normals = {_array(vertex_normals(vertices, faces), 4)} (",
         '    interpolation = "vertex"',
         ")",
@@ -123,7 +170,8 @@ def _mesh(name: str, vertices: np.ndarray, faces: np.ndarray, extra: list[str], 
         "uniform bool doubleSided = 1",
         *extra,
     ]
-    return [f'        def Mesh "{name}"{schemas}', "        {", *("            " + r for r in rows), "        }"]
+    head = f'        def Mesh "{name}"' + (f" (prepend apiSchemas = {json.dumps(schemas)})" if schemas else "")
+    return [head, "        {", *("            " + r for r in rows), "        }"]
 
 
 def _joint(link: Link, base: str) -> list[str]:
@@ -131,9 +179,13 @@ def _joint(link: Link, base: str) -> list[str]:
     kind = "Revolute" if h.type == "revolute" else "Prismatic"
     lo, hi = np.degrees([h.lower, h.upper]) if kind == "Revolute" else (h.lower, h.upper)
     turn = _tuple(x_to(h))
+    drive, damping = ("angular", h.damping * math.pi / 180) if kind == "Revolute" else ("linear", h.damping)  # angular: per degree / s
     return [
-        f'    def Physics{kind}Joint "joint_{link.part}"',
+        f'    def Physics{kind}Joint "joint_{link.part}" (prepend apiSchemas = ["PhysicsDriveAPI:{drive}"])',
         "    {",
+        f'        uniform token drive:{drive}:physics:type = "force"',
+        f"        float drive:{drive}:physics:stiffness = 0",
+        f"        float drive:{drive}:physics:damping = {damping!r}",
         f"        rel physics:body0 = </twin/{base}>",
         f"        rel physics:body1 = </twin/{link.name}>",
         '        uniform token physics:axis = "X"',

@@ -7,11 +7,12 @@ import pytest
 from test_clearance import block, cabinet, link, slide
 
 from p2gs.app import run
-from p2gs.export.asset import Asset, Inertia
+from p2gs.export.asset import Asset
 from p2gs.export.check import check_folder
 from p2gs.export.clearance import clear_links
 from p2gs.export.convex import decompose
 from p2gs.export.engines import ENGINES, check_engine, installed
+from p2gs.export.inertia import Inertia
 from p2gs.export.mjcf import write_mjcf
 from p2gs.export.tsdf import Mesh
 from p2gs.export.urdf import write_urdf
@@ -22,7 +23,7 @@ def with_looks(links):
     """Each link's first piece also as what it shows, and masses of wood."""
     from dataclasses import replace
 
-    from p2gs.export.asset import effective_inertia, inertia_of
+    from p2gs.export.inertia import effective_inertia, inertia_of
 
     out = []
     for one in links:

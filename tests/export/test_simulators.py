@@ -12,11 +12,13 @@ import trimesh
 from solids import intersect
 from toy import toy_scene, toy_twin
 
-from p2gs.export.asset import cluster, inertia_of, load_asset, placement, simplify
+from p2gs.export.asset import load_asset, placement
 from p2gs.export.convex import Piece, decompose, hull
 from p2gs.export.formats import EXPORTERS, export_run
 from p2gs.export.glb import glb_bytes
+from p2gs.export.inertia import inertia_of
 from p2gs.export.run_folder import write_twin
+from p2gs.export.simplify import cluster, simplify
 from p2gs.export.tsdf import Mesh, vertex_normals
 from p2gs.types import Similarity, UserError
 
@@ -255,7 +257,7 @@ def test_scale_up_and_origin(toy, tmp_path):
         export_run(toy, ["urfd"], tmp_path)
     files = export_run(toy, ["obj", "ply"], tmp_path)
     assert all((f / f"part_2.{s}").is_file() for f, s in zip(files, ("obj", "ply"), strict=True))
-    assert set(EXPORTERS) == {"urdf", "mjcf", "glb", "usd", "ply", "obj"}
+    assert set(EXPORTERS) == {"urdf", "mjcf", "glb", "usd", "splats", "ply", "obj"}
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])

@@ -22,8 +22,8 @@ def read(texture: Texture, uv: np.ndarray) -> np.ndarray:
     """Colours [n, 3] in 0..1 at uv [n, 2], between texels as renderers read them."""
     from scipy.ndimage import map_coordinates
 
-    side = len(texture.image)
-    at = np.stack([(1 - uv[:, 1]) * side - 0.5, uv[:, 0] * side - 0.5])
+    height, width = texture.image.shape[:2]
+    at = np.stack([(1 - uv[:, 1]) * height - 0.5, uv[:, 0] * width - 0.5])
     return np.stack([map_coordinates(texture.image[..., c] / 255, at, order=1, mode="nearest") for c in range(3)], 1)
 
 
@@ -38,11 +38,12 @@ def within(count: int, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("count", [1, 2, 3, 50, 1001])
 def test_no_triangle_shows_its_neighbours_colours(count):
     """Every triangle painted in one colour of its own, read anywhere in it, is of that colour."""
-    side, uv = layout(count)
+    (width, height), uv = layout(count)
     triangle, weights, place = texels(count)
-    assert place.min() >= 0 and place.max() < side and len(np.unique(place, axis=0)) == len(place)  # no texel twice
+    assert place.min() >= 0 and (place < [width, height]).all() and len(np.unique(place, axis=0)) == len(place)  # no texel twice
+    assert all(n & (n - 1) == 0 for n in (width, height)) and count * TILE**2 / 2 > width * height / 2 - TILE**2  # at least half is used
     colours = np.random.default_rng(1).integers(0, 256, (count, 3)).astype(np.uint8)
-    image = np.zeros((side, side, 3), np.uint8)
+    image = np.zeros((height, width, 3), np.uint8)
     image[place[:, 1], place[:, 0]] = colours[triangle]
     which, w = within(count, 4000)
     assert np.allclose(read(Texture(uv, image), (uv[which] * w[..., None]).sum(1)), colours[which] / 255, atol=1e-6)
@@ -52,9 +53,9 @@ def test_no_triangle_shows_its_neighbours_colours(count):
 @pytest.mark.parametrize("count", [2, 37])
 def test_texels_lie_where_their_triangle_says(count):
     """A picture of the barycentric coordinates themselves, read anywhere, gives them back."""
-    side, uv = layout(count)
+    (width, height), uv = layout(count)
     triangle, weights, place = texels(count)
-    image = np.zeros((side, side, 3))
+    image = np.zeros((height, width, 3))
     image[place[:, 1], place[:, 0]] = weights * 255
     which, w = within(count, 2000)
     off = np.abs(read(Texture(uv, image), (uv[which] * w[..., None]).sum(1)) - w)
