@@ -31,6 +31,8 @@ from p2gs.models.openings import open_up
 from p2gs.models.owners import hidden_to_owners
 from p2gs.models.part_motions import find_part_motions
 from p2gs.models.phase import Phase
+from p2gs.models.registered import REGISTRATION, correct_scene, register_state, register_views, write_registration
+from p2gs.models.registration import align_states
 from p2gs.models.sealed import Damaged, check_seal
 from p2gs.models.sharpen import SharpenPhase
 from p2gs.models.single_state import SingleStatePhase
@@ -42,7 +44,7 @@ from p2gs.stage_times import note_stage
 from p2gs.stopping import at_step_ends
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError
 
-STAGES = ("single_state", "discovery", "sharpen", "canonical_fusion", "articulation", "finish")
+STAGES = ("single_state", "registration", "discovery", "sharpen", "canonical_fusion", "articulation", "finish")
 
 
 def run(cfg: RunConfig, only: Optional[str] = None) -> Path:
@@ -71,12 +73,14 @@ class Pipeline:
         if self.init != "discovery" and cfg.num_parts == "auto":
             raise UserError(f"num_parts: auto needs phases.articulation.init: discovery (it is '{self.init}'); give --num_parts N")
         self._views: dict[int, TrainingViews] = {}
+        self._registered: Optional[TwoStateScene] = None
         self.times: dict[str, dict] = {}
 
     # -- what stages share ----------------------------------------------------------------------------------------------------
     @property
     def scene(self) -> TwoStateScene:
-        return self.cfg.data.scene()
+        """As read, until the end state is registered to the start; from then on with the end's views in the start's frame."""
+        return self._registered or self.cfg.data.scene()
 
     @property
     def views(self) -> dict[int, TrainingViews]:
@@ -99,7 +103,7 @@ class Pipeline:
             "data": cfg.section("data"),
             "device": self.device.type,
         }
-        if stage.startswith("single_state"):
+        if stage.startswith("single_state") or stage == "registration":
             del common["num_parts"]
         elif self.exact:  # discovery finds what there is; later stages take it to the number that was asked for
             early = stage == "discovery" or stage.startswith("sharpen")
@@ -142,6 +146,11 @@ class Pipeline:
         states = self.single_states(only)
         if only == "single_state":
             return self.run_dir
+        self.correct(states)
+        found = self.stage("registration", only, lambda: self.align(states))
+        if only == "registration":
+            return self.run_dir
+        states = self.register(states, found)
         motions = self.stage("discovery", only, lambda: self.discover(states)) if self.init == "discovery" else None
         if only == "discovery":
             return self.run_dir
@@ -232,6 +241,27 @@ class Pipeline:
     def single_state(self, state: int, section) -> Phase:
         options = {"seed": self.cfg.seed, "rasterizer": self.cfg.rasterizer}
         return SingleStatePhase(section.config, section.losses, self.scene, state, self.views_of(state), **options)
+
+    def correct(self, states) -> None:
+        """Scene and views from here on: cameras and exposures of training photographs as the single states found them."""
+        self.take(correct_scene(self.cfg.data.scene(), states))
+
+    def take(self, scene: TwoStateScene) -> None:
+        """The scene from here on, where it is another one."""
+        if scene is not self.scene:
+            self._registered = scene
+            self._views.clear()
+
+    def align(self, states) -> handover.Registration:
+        config = self.cfg.phases["registration"].config
+        say = partial(print, "registration:", flush=True)
+        return align_states(states, self.evidence(states), self.views, self.scene.box, config, self.cfg.rasterizer, say)
+
+    def register(self, states, found: handover.Registration) -> list[handover.StateGaussians]:
+        """The states in the start's frame; so are scene and views from here on."""
+        write_registration(self.run_dir / REGISTRATION, found, states, self.cfg.data.scene())
+        self.take(register_views(self.scene, found))
+        return [register_state(s, found) for s in states]
 
     def discover(self, states) -> handover.PartMotions:
         return find_part_motions(

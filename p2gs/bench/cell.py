@@ -26,7 +26,7 @@ from p2gs.bench.plan import Cell
 
 PROGRAM = (sys.executable, "-m", "p2gs")
 # stages that a run can take over from another setting's run of the same object and seed
-SHARED = ("single_state_0", "single_state_1", "discovery", "sharpen_0", "sharpen_1", "canonical_fusion", "articulation")
+SHARED = ("single_state_0", "single_state_1", "registration", "discovery", "sharpen_0", "sharpen_1", "canonical_fusion", "articulation")
 
 
 _children: set[subprocess.Popen] = set()

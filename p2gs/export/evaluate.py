@@ -37,6 +37,7 @@ from p2gs.metrics.joints import evaluate_joints
 from p2gs.metrics.lpips import lpips, why_absent
 from p2gs.metrics.lpips import wanted as lpips_wanted
 from p2gs.metrics.penetration import evaluate_penetration
+from p2gs.models.registered import as_fitted
 from p2gs.ops.ssim import psnr, ssim
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError, View
 
@@ -81,7 +82,10 @@ def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict
 
 
 def open_scene(run_dir: Path, root: Optional[Path | str] = None):
-    """The scene of a run in input coordinates, and its ground truth or None."""
+    """The scene of a run in input coordinates, its photographs corrected as the fit did, and its ground truth or None.
+
+    The truth is the start's frame: the start's cameras are the ones it was measured with.
+    """
     from p2gs.config import load_config
     from p2gs.data.ground_truth import load_ground_truth
     from p2gs.data.layouts import LAYOUTS
@@ -93,7 +97,7 @@ def open_scene(run_dir: Path, root: Optional[Path | str] = None):
     scene = cfg.data.raw_scene()
     folder, name = getattr(cfg.data, "root", None), cfg.data_options["format"]
     truth = None if folder is None else load_ground_truth(folder, name if name in LAYOUTS else None, cfg.data_options.get("source"))
-    return scene, truth
+    return as_fitted(scene, run_dir), truth
 
 
 def scene_folder(run_dir: Path) -> Path:

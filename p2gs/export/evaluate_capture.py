@@ -18,6 +18,7 @@ from p2gs.data.ground_truth import parse_joint
 from p2gs.export.evaluate import scene_folder
 from p2gs.export.twin_json import load_twin
 from p2gs.metrics.joints import evaluate_joints
+from p2gs.models.registered import REGISTRATION, read_registration
 from p2gs.types import Joint, UserError
 
 STATES = ("start", "end")
@@ -86,6 +87,7 @@ def evaluate_capture(run: Path | str, truth: Path | str, root: Optional[Path | s
     pairs = camera_pairs(scene, truth)
     T = rigid_between(*pairs["start"], with_scale=True)
     end_own, end_true = pairs["end"]
+    end_own = read_registration(run / REGISTRATION)[0].transform.numpy() @ end_own  # where the run has put them
     placed = end_own.copy()
     placed[:, :3, 3] = end_own[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
     D = rigid_between(placed, end_true, with_scale=False)

@@ -16,11 +16,41 @@ from p2gs.types import GaussianTensors
 
 
 @dataclass
+class ViewCorrections:
+    """What was wrong with a state's V training photographs, in the scene's order.
+
+    motions [V, 4, 4] float64, internal units: the camera's viewmat is to be multiplied by it from the right.  log_gains [V, 3]: natural
+    logarithm of how much brighter, in linear light, the photograph is than the state's mean one.
+    """
+
+    motions: Tensor
+    log_gains: Tensor
+
+
+@dataclass
 class StateGaussians:
-    """A single state reconstructed. state: 0 start, 1 end."""
+    """A single state reconstructed. state: 0 start, 1 end.  corrections: of its photographs, where there are any."""
 
     state: int
     gaussians: GaussianTensors
+    corrections: Optional[ViewCorrections] = None
+
+
+@dataclass
+class Registration:
+    """Where the end state's reconstruction and cameras stand against the start's, as held-out photographs confirmed it.
+
+    transform [4, 4] float64: end -> start, internal units.  log_gain [3]: natural logarithm of how much brighter, in linear light, the
+    end's photographs are.  figures: what was measured, also of what is not applied.
+    """
+
+    transform: Tensor
+    log_gain: Tensor
+    figures: dict = field(default_factory=dict)
+
+    @property
+    def is_identity(self) -> bool:
+        return not bool(self.log_gain.any()) and torch.equal(self.transform, torch.eye(4).to(self.transform))
 
 
 @dataclass
@@ -95,7 +125,8 @@ class Articulation:
         return self.probs.argmax(dim=1)
 
 
-_CLASSES = {c.__name__: c for c in (GaussianTensors, StateGaussians, PartMotions, CanonicalGaussians, Articulation)}
+_HANDED_OVER = (GaussianTensors, ViewCorrections, StateGaussians, Registration, PartMotions, CanonicalGaussians, Articulation)
+_CLASSES = {c.__name__: c for c in _HANDED_OVER}
 
 
 def _pack(value):

@@ -11,13 +11,14 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
 from p2gs.losses.base import Loss, LossInputs, Target
+from p2gs.models.draw import render_gaussians
 from p2gs.models.handover import StateGaussians
 from p2gs.models.health import check_gaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
 from p2gs.models.phase import Phase, PhaseConfig, exponential, register_phase
-from p2gs.models.splats import Splats, SplitGaussians
+from p2gs.models.splats import Splats
+from p2gs.models.view_fit import ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
 from p2gs.models.visibility import visible_share
-from p2gs.render import rasterize_stored
 from p2gs.types import Camera, GaussianTensors, RenderOutput, TwoStateScene
 
 
@@ -62,7 +63,8 @@ class SingleStateConfig(ImageConfig):
     steps: paper 30,000.  initial_gaussians: random points in the object's box (or depth points where ``init`` says so).
     sh_degree: 0-3.  sh_every: steps until the next degree is switched on.  init: "auto" takes depth points where the scene has
     depth, "random" never does.  initial_opacity: low, so that concavities stay open until the images fill them.  min_visible: Gaussians
-    of which no training view sees this share are left out at the end: nothing formed them (0 = keep all).
+    of which no training view sees this share are left out at the end: nothing formed them (0 = keep all).  forgive: errors of single
+    photographs.
     """
 
     steps: int = 6000
@@ -72,6 +74,7 @@ class SingleStateConfig(ImageConfig):
     sh_degree: int = 1
     sh_every: int = 500
     min_visible: float = 0.1
+    forgive: ViewFitConfig = field(default_factory=ViewFitConfig)
     rates: SplatRates = field(default_factory=SplatRates)
 
 
@@ -130,26 +133,6 @@ class ImagePhase(Phase):
         return name in self.losses and self.losses[name].active(self.step, self.total_steps)
 
 
-def render_gaussians(g: GaussianTensors, camera: Camera, background: Tensor | None = None, **options) -> RenderOutput:
-    """``render.rasterize_stored`` of Gaussians; depth moments are taken about the distance of the origin (the box's centre)."""
-    sh, sh_rest = (g.sh0, g.sh_rest) if isinstance(g, SplitGaussians) else (g.sh, None)
-    return rasterize_stored(
-        g.means,
-        g.quats,
-        g.log_scales,
-        g.opacity_logits,
-        sh,
-        sh_rest,
-        camera.viewmat,
-        camera.K,
-        camera.width,
-        camera.height,
-        background=background,
-        depth_ref=float(camera.viewmat[2, 3]),
-        **options,
-    )
-
-
 class StatePhase(ImagePhase):
     """A phase of one state's Gaussians and photographs, with the config's ``rates``. Runs once for each state."""
 
@@ -188,18 +171,58 @@ class SingleStatePhase(StatePhase):
         super().__init__(config, losses, state, views, **common)
         points, colours = initial_points(scene, state, config.initial_gaussians, config.init, self.generator(0, 2))
         self.splats = Splats(isotropic_gaussians(points, colours, config.initial_opacity, config.sh_degree))
+        self.shots = scene.select(state=state, split="train")
+        self.errors, self.without_gains = ViewErrors(len(self.shots)), None
 
     def inputs(self, step: int) -> LossInputs:
+        self.forgive(step)
         camera, target = self.target(step, self.state)
+        camera = self.errors.camera(view_index(self.seed + 7919 * self.state, step, len(self.shots)), camera)
         g = self.splats.tensors()
         degree = min(self.config.sh_degree, step // max(self.config.sh_every, 1))
         render = self.render(g, camera, target.background, degree)
         return LossInputs(step, self.total_steps, g, render, target, camera, cache=self.loss_cache)
 
+    def constrain_gradients(self) -> None:
+        config = self.config.forgive
+        fraction = (self.step / max(self.total_steps, 1) - config.at) / max(1 - config.at, 1e-9)
+        self.errors.learn(config.rate * exponential(1.0, 0.01, fraction))
+
+    def forgive(self, step: int) -> None:
+        """At their steps: decide which errors of photographs are looked for, and measure the gains; photographs lose the gains known."""
+        config, errors = self.config.forgive, self.errors
+        due = [round(share * self.total_steps) for share in (config.at, *config.again)]
+        if step == due[0] and not bool(errors.decided):
+            self.decide()
+        elif step in due[1:] and bool(errors.on[0]):
+            self.measure()
+        known = errors.log_gains.cpu()
+        if bool(known.any()) and (self.without_gains is None or not torch.equal(known, self.without_gains)):
+            self.views[self.state] = TrainingViews(errors.views(self.shots), self.views[self.state].levels)
+            self.without_gains = known.clone()
+
+    def decide(self) -> None:
+        config, errors, g = self.config.forgive, self.errors, self.splats.tensors().detach()
+        errors.decided.fill_(True)
+        for k, (wanted, name, judge) in enumerate(((config.gains, "gains", try_gains), (config.cameras, "cameras", try_cameras))):
+            if wanted == "never":
+                continue
+            found = judge(g, self.views[self.state], config, self.rasterizer)
+            errors.on[k] = found.passed(config.least)
+            print(f"{self.phase_name}: {name} of single photographs: {found.told()}: {'on' if errors.on[k] else 'off'}", flush=True)
+            if k == 0 and bool(errors.on[0]):
+                self.measure()
+                self.forgive(-1)  # the cameras are judged by photographs without gains
+
+    def measure(self) -> None:
+        self.errors.log_gains += measure_gains(
+            self.splats.tensors().detach(), self.views[self.state], self.config.forgive.levels[0], self.rasterizer
+        )
+
     def hand_over(self) -> StateGaussians:
-        g, views = self.splats.tensors().clone(), self.views[self.state]
+        g, views, corrections = self.splats.tensors().clone(), self.views[self.state], self.errors.handed_over()
         if self.config.min_visible > 0 and len(g):
             cameras = [views.camera(i, views.levels.index(self.config.levels[-1])) for i in range(len(views))]
             g = g[visible_share(g, cameras, self.rasterizer, g.means.device) >= self.config.min_visible]
         check_gaussians(self.phase_name, len(g), len(self.splats))
-        return StateGaussians(self.state, g)
+        return StateGaussians(self.state, g, corrections)

@@ -84,8 +84,8 @@ public:
         frame_->forward(a, keep, threads < 1 ? 1 : threads);
     }
 
-    // gradients of colour, alpha, depth, depth_sq, features | to means, quats, scales, opacities, sh, features, abs_grad, sh_rest
-    void backward(const std::array<Address, 13>& at, int threads) {
+    // gradients of colour, alpha, depth, depth_sq, features | to means, quats, scales, opacities, sh, features, abs_grad, sh_rest, view
+    void backward(const std::array<Address, 14>& at, int threads) {
         RasterGrads g = {};
         g.colour = pointer<const float>(at[0]);
         g.alpha = pointer<const float>(at[1]);
@@ -100,6 +100,7 @@ public:
         g.v_features = pointer<float>(at[10]);
         g.abs_grad = pointer<float>(at[11]);
         g.sh_rest = pointer<float>(at[12]);
+        g.view = pointer<float>(at[13]);
         nb::gil_scoped_release release;
         frame_->backward(args_, g, threads < 1 ? 1 : threads);
     }
@@ -122,7 +123,7 @@ void bind_raster(nb::module_& m) {
              "With sh_rest, sh is the constant band alone.")
         .def("backward", &RasterView::backward,
              "addresses (gradients by colour, alpha, depth, depth_sq, features; gradients to means, quats, scales, opacities, sh, features, "
-             "abs_grad, sh_rest; 0 = none), threads");
+             "abs_grad, sh_rest, rows of viewmat [3, 4]; 0 = none), threads");
 }
 
 }  // namespace p2gs

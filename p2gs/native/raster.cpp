@@ -166,12 +166,26 @@ void scatter(RasterFrame& f, const uint64_t* order, uint32_t count, uint32_t* me
     parallel_for(pieces, pieces, pieces == 1 ? scatter_piece<true> : scatter_piece<false>, &s);
 }
 
+// The chunks' sums, in double and in order, as the gradient by the rows of world -> camera (R, t). Directions of sight start at the camera's
+// centre -R^T t: with s = d loss / d (R^T t), t gets R s and R gets t s^T.
+void camera_gradient(const RasterArgs& a, const RasterFrame& f, float* view) {
+    double sum[kPull] = {};
+    for (int c = 0; c < f.chunks; ++c)
+        for (int k = 0; k < kPull; ++k) sum[k] += f.pulls[size_t(c) * kPull + k];
+    const double* s = sum + 12;
+    for (int r = 0; r < 3; ++r) {
+        const float* row = a.view + 4 * r;
+        for (int k = 0; k < 3; ++k) view[4 * r + k] = float(sum[3 * r + k] + row[3] * s[k]);
+        view[4 * r + 3] = float(sum[9 + r] + row[0] * s[0] + row[1] * s[1] + row[2] * s[2]);
+    }
+}
+
 }  // namespace
 
 Frame::~Frame() {
     for (size_t c = 0; c < pairs_size; ++c) std::free(pairs[c].data);
     void* all[] = {records, pair_range, pairs, chunk_slot, keys, ids, visible, tile_begin, tile_end, tile_blocks, entries, slots,
-                   slot_used, slopes_memory, sort.a, sort.b, sort.counts, tile_counts};
+                   slot_used, slopes_memory, pulls_memory, sort.a, sort.b, sort.counts, tile_counts};
     for (void* p : all) std::free(p);
 }
 
@@ -247,6 +261,8 @@ void Frame::backward(const RasterArgs& a, const RasterGrads& g, int threads) {
     reserve(slots, slots_size, total * size_t(slot_stride));
     reserve(slot_used, slot_used_size, total);
     std::memset(slot_used, 0, total);
+    if (g.view) reserve(pulls_memory, pulls_size, size_t(chunks) * kPull);
+    pulls = g.view ? pulls_memory : nullptr;
     struct Context {
         const RasterArgs& a;
         const RasterGrads& g;
@@ -261,6 +277,7 @@ void Frame::backward(const RasterArgs& a, const RasterGrads& g, int threads) {
         const Context& c = *static_cast<const Context*>(p);
         c.k.reduce(c.a, c.g, c.f, chunk);
     }, &c);
+    if (g.view) camera_gradient(a, *this, g.view);
 }
 
 }  // namespace p2gs

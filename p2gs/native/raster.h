@@ -17,6 +17,7 @@ constexpr int kChunk = 512;        // Gaussians
 constexpr int kMaxFeatures = 16;
 constexpr int kSlopes = 12;        // per Gaussian and channel: 1 or 0 (not clamped, clamped), then d colour / d direction
 constexpr int kSlot = 16;          // floats of a gradient slot before the features
+constexpr int kPull = 15;          // sums of a chunk's gradients by the camera: 9 rotation, 3 translation, 3 by the camera's centre
 constexpr float kMinAlpha = 1.0f / 255, kMaxAlpha = 0.99f, kStop = 1e-4f, kFar = 1e10f;
 constexpr float kFaint = 7.99435344f;  // -log2(kMinAlpha)
 
@@ -66,10 +67,11 @@ struct RasterArgs {
     int32_t* radii;
 };
 
-// d loss / d outputs (each may be null) and where d loss / d inputs go (abs_grad and v_features may be null).
+// d loss / d outputs (each may be null) and where d loss / d inputs go (abs_grad, v_features and view may be null).
 struct RasterGrads {
     const float *colour, *alpha, *depth, *depth_sq, *features;
     float *means, *quats, *scales, *opacities, *sh, *sh_rest, *v_features, *abs_grad;
+    float* view;  // 12, as RasterArgs::view
 };
 
 // Working memory of one view, kept from forward to backward.
@@ -87,6 +89,7 @@ struct RasterFrame {
     uint32_t* tile_end;             // tiles: end of what forward looked at
     RasterEntry* entries;           // pairs in all, by tile, near to far
     float* slots;
+    float* pulls;                   // kPull a chunk; null where the camera's gradient is not wanted
     uint8_t* slot_used;
     int slot_stride;
     bool out_of_memory;

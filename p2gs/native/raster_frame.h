@@ -26,11 +26,11 @@ struct Frame : RasterFrame {
 
     const RasterKernels* table = nullptr;
     SortBuffers sort;
-    float* slopes_memory = nullptr;
+    float *slopes_memory = nullptr, *pulls_memory = nullptr;
     uint32_t* tile_counts = nullptr;
     size_t records_size = 0, pair_range_size = 0, pairs_size = 0, chunk_slot_size = 0, keys_size = 0, ids_size = 0,
            visible_size = 0, tile_begin_size = 0, tile_end_size = 0, entries_size = 0, slots_size = 0, slot_used_size = 0,
-           tile_counts_size = 0, slopes_size = 0, tile_blocks_size = 0;
+           tile_counts_size = 0, slopes_size = 0, tile_blocks_size = 0, pulls_size = 0;
 };
 
 }  // namespace p2gs

@@ -85,7 +85,7 @@ def rasterize(
     """Splat N Gaussians into one view of ``height`` x ``width`` pixels (Kerbl et al. 2023, doi:10.1145/3592433).
 
     means [N, 3] world; quats [N, 4] wxyz of any length but zero; scales [N, 3] standard deviations; opacities [N] in 0..1;
-    sh [N, B, 3] with B = 1, 4, 9 or 16; viewmat [4, 4] world -> camera, K [3, 3] in pixels (see ``types``), both without gradient.
+    sh [N, B, 3] with B = 1, 4, 9 or 16; viewmat [4, 4] world -> camera, K [3, 3] in pixels (see ``types``).
     sh_degree: use only the bands up to it.  features [N, F], F <= 16: composited like colour, over nothing.
     background [3] or [H, W, 3] (default black).  depth_sq: also accumulate (z - depth_ref)^2.
     near: Gaussians nearer than this (scene units) are culled.  eps2d: variance in pixels^2 added to every projected
@@ -98,7 +98,8 @@ def rasterize(
 
     A Gaussian contributes alpha = min(0.99, opacity exp(-d^T C^-1 d / 2)) where that is at least 1/255; a pixel is finished
     before its transmittance would fall to 1e-4; colour is max(0, 0.5 + SH(view direction)). A Gaussian with a NaN or infinity in
-    any input is culled and gets zero gradient. Differentiable by means, quats, scales, opacities, sh, features and background.
+    any input is culled and gets zero gradient. Differentiable by means, quats, scales, opacities, sh, features, background and by the first
+    three rows of viewmat, each of their twelve numbers for itself.
 
     Raises ValueError for shapes that do not fit, UserError for a backend that is unknown or cannot run here.
     """

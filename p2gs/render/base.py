@@ -115,7 +115,7 @@ def check(a: RenderInputs, sh_degree: Optional[int], median_depth: Optional[bool
         if t is not None and t.device != a.means.device:
             raise ValueError(f"rasterize: all tensors must be on one device, got {a.means.device} and {t.device}")
     if median_depth is None:
-        recorded = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (a.means, *others))
+        recorded = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (a.means, a.viewmat, *others))
         a.median_depth = not recorded
     else:
         a.median_depth = bool(median_depth)

@@ -48,10 +48,10 @@ def _forward(a: RenderInputs, keep: bool, means, quats, scales, opacities, sh, f
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, a: RenderInputs, abs_grad, means, quats, scales, opacities, sh, features, background, sh_rest):
+    def forward(ctx, a: RenderInputs, abs_grad, viewmat, means, quats, scales, opacities, sh, features, background, sh_rest):
         ctx.set_materialize_grads(False)
         view, out = _forward(a, True, means, quats, scales, opacities, sh, features, background, sh_rest)
-        ctx.view, ctx.abs_grad = view, abs_grad
+        ctx.view, ctx.abs_grad, ctx.of_camera = view, abs_grad, viewmat.dtype
         # the kernels read these again: saving them lets autograd notice when somebody has written into one
         ctx.save_for_backward(means, quats, scales, opacities, sh, features, background, sh_rest, *out[:5])
         ctx.mark_non_differentiable(*(t for t in out[5:] if t is not None))
@@ -65,19 +65,21 @@ class _Rasterize(torch.autograd.Function):
         gradients = [torch.empty_like(t) for t in (means, quats, scales, opacities, sh)]
         # without a gradient by the rendered features, theirs is zero and the kernels take the path without them
         v_features = None
-        if features is not None and ctx.needs_input_grad[7]:
+        if features is not None and ctx.needs_input_grad[8]:
             v_features = torch.empty_like(features) if features_out is not None else torch.zeros_like(features)
         native_features = v_features if features_out is not None else None
         if features_out is not None and v_features is None:
             native_features = torch.empty_like(features)
         v_rest = None if sh_rest is None else torch.empty_like(sh_rest)
-        ctx.view.backward([_address(t) for t in (*incoming, *gradients, native_features, ctx.abs_grad, v_rest)], num_threads())
+        v_view = torch.zeros(4, 4) if ctx.needs_input_grad[2] else None  # its last row is (0, 0, 0, 1) and stays
+        ctx.view.backward([_address(t) for t in (*incoming, *gradients, native_features, ctx.abs_grad, v_rest, v_view)], num_threads())
         v_background = None
-        if background is not None and ctx.needs_input_grad[8] and colour is not None:
+        if background is not None and ctx.needs_input_grad[9] and colour is not None:
             v_background = (1 - out_alpha)[..., None] * incoming[0]
             if background.dim() == 1:  # in double: the same float for any number of threads
                 v_background = v_background.double().sum((0, 1)).float()
-        return None, None, *gradients, v_features, v_background, v_rest
+        v_view = None if v_view is None else v_view.to(ctx.of_camera)
+        return None, None, v_view, *gradients, v_features, v_background, v_rest
 
 
 @RASTERIZERS.register("cpu")
@@ -87,8 +89,8 @@ def rasterize_cpu(a: RenderInputs) -> RenderOutput:
         raise UserError(f"the rasterizer 'cpu' renders tensors on the CPU, these are on {a.means.device}")
     tensors = [_plain(t) for t in (a.means, a.quats, a.scales, a.opacities, a.sh, a.features, a.background, a.sh_rest)]
     abs_grad = torch.zeros(a.means.shape[0]) if a.absgrad else None
-    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors):
-        out = _Rasterize.apply(a, abs_grad, *tensors)
+    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (a.viewmat, *tensors)):
+        out = _Rasterize.apply(a, abs_grad, a.viewmat, *tensors)
     else:
         out = _forward(a, False, *tensors)[1]
     colour, alpha, depth, depth_sq, features, median, radii = out

@@ -46,7 +46,7 @@ def rasterize_gsplat(a: RenderInputs) -> RenderOutput:
 def through_gsplat(a: RenderInputs) -> RenderOutput:
     """The mapping onto gsplat's arguments and back, whatever the device."""
     device, dtype = a.means.device, torch.float32
-    viewmat, K = a.viewmat.detach().to(device, dtype), a.K.detach().to(device, dtype)
+    viewmat, K = a.viewmat.to(device, dtype), a.K.detach().to(device, dtype)
     R, t = viewmat[:3, :3], viewmat[:3, 3]
 
     ok, (means, quats, scales, opacities, sh, *features) = _sane(a)

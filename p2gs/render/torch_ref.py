@@ -59,7 +59,7 @@ def _usable(a: RenderInputs) -> Tensor:
 def project(a: RenderInputs, dtype: torch.dtype) -> Splats:
     """Project, cull and sort by depth; ``values`` = colour 3, z, (z - depth_ref)^2, features."""
     device = a.means.device
-    viewmat, K = a.viewmat.detach().to(device, dtype), a.K.detach().to(device, dtype)
+    viewmat, K = a.viewmat.to(device, dtype), a.K.detach().to(device, dtype)
     W, t = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
 

@@ -23,7 +23,7 @@ def test_the_folders_are_not_empty():
 @pytest.mark.parametrize("name", ["demo.yaml", *files("preset")])
 def test_presets_name_every_stage(name):
     cfg = load_config([name])
-    assert list(cfg.phases) == ["single_state", "discovery", "sharpen", "canonical_fusion", "articulation", "finish"]
+    assert list(cfg.phases) == ["single_state", "registration", "discovery", "sharpen", "canonical_fusion", "articulation", "finish"]
     for phase in ("single_state", "canonical_fusion", "articulation"):
         assert "render" in cfg.phases[phase].losses
         assert {"progress", "scalars", "checkpoint", "evaluation"} <= set(cfg.phases[phase].callbacks)

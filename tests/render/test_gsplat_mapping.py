@@ -3,6 +3,7 @@
 import importlib
 import sys
 import types
+from contextlib import contextmanager
 
 import torch
 from worlds import OUTPUTS, backward, relative_error, world
@@ -30,7 +31,9 @@ def _rasterization(
     return image[None], out.alpha[None, ..., None], {"radii": out.radii[None, :, None].expand(1, n, 2), "means2d": means2d}
 
 
-def test_same_as_the_reference(monkeypatch):
+@contextmanager
+def stand_in_backend(monkeypatch):
+    """Within it gsplat is the stand-in; gives the name of the backend that goes through it."""
     stand_in = types.ModuleType("gsplat")
     stand_in.rasterization = _rasterization
     monkeypatch.setitem(sys.modules, "gsplat", stand_in)
@@ -38,20 +41,28 @@ def test_same_as_the_reference(monkeypatch):
     monkeypatch.delitem(sys.modules, "p2gs.render.gsplat", raising=False)
     backend = importlib.import_module("p2gs.render.gsplat")
     base.RASTERIZERS._items["stand_in"] = backend.through_gsplat
+    yield "stand_in"
+    monkeypatch.delitem(sys.modules, "p2gs.render.gsplat")
 
+
+def test_same_as_the_reference(monkeypatch):
+    with stand_in_backend(monkeypatch) as name:
+        _compare(name)
+
+
+def _compare(name: str) -> None:
     for options in ({}, {"depth_sq": True, "depth_ref": 2.5}, {"eps2d": 0.1, "antialias": True}):
         w = world(60, 40, 30, features=3, background="image", seed=4)
         w.tensors["means"][5, 1] = torch.nan
         w.tensors["sh"][6, 2, 0] = torch.inf
         want, x = w.render("torch_ref", torch.float32, **options)
-        got, y = w.render("stand_in", torch.float32, absgrad=True, **options)
-        for name in OUTPUTS:
-            if getattr(want, name) is not None:
-                assert relative_error(getattr(got, name), getattr(want, name)) < 1e-5, name
+        got, y = w.render(name, torch.float32, absgrad=True, **options)
+        for output in OUTPUTS:
+            if getattr(want, output) is not None:
+                assert relative_error(getattr(got, output), getattr(want, output)) < 1e-5, output
         assert torch.equal(want.radii, got.radii)
         want, gradients = backward(want, x), backward(got, y)
-        for name in want:
-            assert gradients[name].isfinite().all()
-            assert relative_error(gradients[name], want[name]) < 1e-5, name
+        for leaf in want:
+            assert gradients[leaf].isfinite().all()
+            assert relative_error(gradients[leaf], want[leaf]) < 1e-5, leaf
         assert torch.equal(got.means2d_abs_grad, torch.full((60,), 5.0))
-    monkeypatch.delitem(sys.modules, "p2gs.render.gsplat")

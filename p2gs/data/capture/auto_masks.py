@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from p2gs.data.capture.coarse import REGION, Picture, Region, fit, initial, object_rows, region_of
-from p2gs.data.capture.gains import corrected
 from p2gs.data.capture.joint import is_end, states_of
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.write import pinhole_of
+from p2gs.data.exposure import corrected
 from p2gs.types import Camera, UserError
 
 COARSE = 200  # px, long edge of the splat's pictures

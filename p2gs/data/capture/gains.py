@@ -12,21 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from p2gs.data.capture.model import Model
+from p2gs.data.exposure import linear
 
 DARK, BRIGHT = 10, 245  # of 255: outside, sensors are not linear
 ROUNDS = 10
 MIN_POINTS = 15  # photographs that share fewer keep their colours
 LIMIT = 1.0  # natural log: a factor of 2.7 either way; more is no exposure difference of one session
-
-
-def linear(srgb: np.ndarray) -> np.ndarray:
-    """sRGB 0..1 to linear light (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def encoded(light: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB 0..1."""
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def sampled_colours(model: Model, folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -76,11 +67,3 @@ def photo_gains(model: Model, folder: Path) -> dict[int, np.ndarray]:
     rows, images, logs = sampled_colours(model, folder)
     found = solve_gains(rows, images, logs) if len(rows) else {}
     return {key: found.get(key, np.zeros(3)) for key in model.photos}
-
-
-def corrected(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """A photograph [H, W, 3] uint8 RGB with its gain taken out."""
-    table = [
-        np.rint(255 * np.clip(encoded(linear(np.arange(256) / 255) * np.exp(-g)), 0, 1)).astype(np.uint8) for g in gain
-    ]
-    return np.stack([t[image[..., c]] for c, t in enumerate(table)], axis=-1)

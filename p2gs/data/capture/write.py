@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from p2gs.data.capture.colmap_io import write_model
-from p2gs.data.capture.gains import corrected
 from p2gs.data.capture.model import Lens, Model
+from p2gs.data.exposure import corrected
 from p2gs.types import UserError
 
 STATES = ("start", "end")

@@ -1,0 +1,152 @@
+"""Where the end state stands against the start, and how much darker its photographs are: one rigid motion and one gain.
+
+Two reconstructions of one object are as far apart as the cameras of the two captures are; discovery would take that for motion, and joints
+would have it in them. The motion with the widest support near the identity is the base's (``surface_fit``); photographs refine it
+(``photo_fit``), and photographs held out of that decide whether it is applied. The same for the gain. Clean states stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from p2gs.data.exposure import median_gain
+from p2gs.data.views import TargetImage, TrainingViews
+from p2gs.models.discovery.evidence import DepthStack, StateEvidence
+from p2gs.models.discovery.surfels import build_surfels
+from p2gs.models.handover import Registration, StateGaussians
+from p2gs.models.phase import PHASES
+from p2gs.models.photo_fit import COLOUR, STRUCTURE, PhotoSide, compare, fit_photographs, photograph, unmoved
+from p2gs.models.registered import dimmed
+from p2gs.models.surface_fit import fit_surfaces
+from p2gs.models.trial import held_out, trial
+from p2gs.ops import se3, so3
+from p2gs.types import GaussianTensors
+
+NOISE = 2e-4  # least noise of surfels, of the box's diagonal: discovery's
+
+
+@dataclass
+class RegistrationConfig:
+    """Options of the states' registration. Lengths are shares of the box's diagonal.
+
+    motion, gain: "auto" (held-out photographs decide) or "never".  reach: distance up to which unmoved surfaces are looked for; states
+    brought together by hand are off by about a hundredth.  steps: of refinement by photographs, a side and size.  sizes: of those
+    photographs, pixels.  surfels: at most so many a state.  least: share by which held-out errors must fall.  least_shift: a motion that
+    moves surfaces by less is not applied: a tenth of a pixel of the finest photographs.
+    """
+
+    motion: Literal["auto", "never"] = "auto"
+    gain: Literal["auto", "never"] = "auto"
+    reach: float = 0.03
+    steps: int = 100
+    levels: list[int] = field(default_factory=lambda: [200, 400])
+    surfels: int = 12000
+    least: float = 0.02
+    least_shift: float = 3e-4
+
+
+def align_states(
+    states: list[StateGaussians],
+    evidence: list[StateEvidence],
+    views: dict[int, TrainingViews],
+    box: Tensor,
+    config: RegistrationConfig,
+    backend: str = "auto",
+    report=None,
+) -> Registration:
+    """The end's motion into the start's frame and its gain, each none where it is not wanted or held-out photographs are no better with it.
+
+    evidence: of both states, as discovery looks at them.  box: the object's, [2, 3].  All in internal coordinates.
+    """
+    say = report or (lambda text: None)
+    still, dark = torch.eye(4, dtype=torch.float64), torch.zeros(3)
+    if config.motion == "never" and config.gain == "never":
+        return Registration(still, dark)
+    if any(len(e.points) < 10 or not any(bool((d > 0).any()) for d in e.depths) for e in evidence):
+        return Registration(still, dark)  # nothing opaque: discovery says so
+    diagonal = float((box[1] - box[0]).norm())
+    surfels = [build_surfels(e, DepthStack(e.depths, e.alphas, e.cameras), diagonal, config.surfels, NOISE)[0] for e in evidence]
+    found = fit_surfaces(surfels[1], surfels[0], config.reach * diagonal)
+    T = found.transform if config.motion == "auto" else still
+    tolerance = 4 * (surfels[0].noise ** 2 + surfels[1].noise ** 2) ** 0.5 + 2e-3 * diagonal
+    pair = Pair(states[0].gaussians, states[1].gaussians, views, tolerance, backend)
+    fitted, judged = zip(*(held_out(len(views[s])) for s in (1, 0)), strict=True)
+    gain = pair.end_gain(T, fitted[0], config.levels[0]) if config.gain == "auto" else dark
+    for size in config.levels if config.motion == "auto" else ():
+        T = fit_photographs(pair.sides(gain), T, fitted, config.steps, size, tolerance, backend=backend)
+    shots = pair.judges(judged, config.levels[-1], T)
+    moved = trial(pair.errors(shots, still, gain, STRUCTURE), pair.errors(shots, T, gain, STRUCTURE))
+    points = surfels[1].points.double()
+    shift = float((se3.apply(T, points) - points).norm(dim=1).square().mean().sqrt()) / diagonal
+    apply_motion = config.motion == "auto" and shift > config.least_shift and moved.passed(config.least)
+    best = T if apply_motion else still
+    dimmer = trial(pair.errors(shots, best, dark, COLOUR), pair.errors(shots, best, gain, COLOUR))
+    apply_gain = config.gain == "auto" and dimmer.passed(config.least)
+    angle = float(torch.rad2deg(so3.rotation_angle(T[:3, :3])))
+    figures = {
+        "share": found.share, "spread": found.spread / diagonal, "rms": found.rms / diagonal, "shift": shift, "angle": angle,
+        "log_gain": gain.tolist(),
+        "motion": {"applied": apply_motion, **vars(moved)}, "gain": {"applied": apply_gain, **vars(dimmer)},
+    }  # fmt: skip
+    beside = f"{100 * shift:.3f} % of the object and {angle:.3f} degrees beside the start, by {100 * found.share:.0f} % of its surface"
+    say(f"the end lies {beside}; {moved.told()}: {'applied' if apply_motion else 'not applied'}")
+    factors = ", ".join(f"{g:.3f}" for g in gain.exp().tolist())
+    say(f"the end's red, green and blue are {factors} times the start's; {dimmer.told()}: {'applied' if apply_gain else 'not applied'}")
+    return Registration(best, gain if apply_gain else dark, figures)
+
+
+@dataclass
+class Pair:
+    """Both states' Gaussians and photographs.  tolerance: of depths of one surface, internal units."""
+
+    start: GaussianTensors
+    end: GaussianTensors
+    views: dict[int, TrainingViews]
+    tolerance: float
+    backend: str
+
+    def sides(self, gain: Tensor) -> list[PhotoSide]:
+        """The start's Gaussians in the end's photographs, as bright as those, and the reverse."""
+        return [
+            PhotoSide(dimmed(self.start, gain), self.end, self.views[1], True),
+            PhotoSide(dimmed(self.end, -gain), self.start, self.views[0], False),
+        ]
+
+    @torch.no_grad()
+    def end_gain(self, transform: Tensor, picks: list[int], size: int) -> Tensor:
+        """Logarithm [3] of how much brighter the end's photographs are than the start's Gaussians where nothing moved: their median."""
+        side, found = self.sides(torch.zeros(3))[0], []
+        for index in picks:
+            shot = photograph(self.views[1], index, size, self.start.means.device)
+            weight = unmoved(side, shot.camera, transform, self.tolerance, self.backend)
+            drawn = side.draw(shot.camera, transform, self.backend)
+            gain = median_gain(shot.image, drawn.colour, (weight > 0) & (shot.alpha > 0.99) & (drawn.alpha > 0.99))
+            found += [] if gain is None else [gain.cpu()]
+        return torch.stack(found).median(0).values if found else torch.zeros(3)
+
+    def judges(self, picks: list[list[int]], size: int, transform: Tensor) -> list[tuple[int, TargetImage, Tensor]]:
+        """Held-out photographs of the end and of the start: the side, the picture, and where nothing moved by ``transform``."""
+        out = []
+        for turn, side in enumerate(self.sides(torch.zeros(3))):
+            for index in picks[turn]:
+                shot = photograph(side.views, index, size, self.start.means.device)
+                out.append((turn, shot, unmoved(side, shot.camera, transform, self.tolerance, self.backend)))
+        return out
+
+    @torch.no_grad()
+    def errors(self, shots, transform: Tensor, gain: Tensor, ssim_lambda: float) -> Tensor:
+        """Image loss [N] of ``judges`` under a motion and a gain."""
+        sides = self.sides(gain)
+        return torch.stack([compare(sides[k], shot, weight, transform, self.backend, ssim_lambda) for k, shot, weight in shots]).cpu()
+
+
+@PHASES.register("registration")
+class RegistrationStage:
+    """A stage without training: no losses, no callbacks."""
+
+    Config = RegistrationConfig
+    trained = False

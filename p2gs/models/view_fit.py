@@ -1,0 +1,187 @@
+"""Small errors of single photographs, found beside the Gaussians: each one's exposure and white balance, and its camera.
+
+A camera goes from V to V exp(xi), xi a twist in world coordinates about the origin (the middle of the object's box): all of them moved
+alike would be the object moved, so the mean of xi is held at zero. So is that of the gains' logarithms: a colour cast of all photographs
+is the object's colour. What is on is decided by the photographs themselves: each is halved like a chessboard, and what is fitted to one
+half must explain the other half better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from p2gs.data.exposure import brightened, median_gain
+from p2gs.data.views import TargetImage, TrainingViews
+from p2gs.models.draw import render_gaussians
+from p2gs.models.handover import ViewCorrections
+from p2gs.models.photo_fit import GREY, STRUCTURE, photograph
+from p2gs.models.registered import correct_views
+from p2gs.models.trial import Trial, trial
+from p2gs.ops import se3
+from p2gs.ops.ssim import l1_ssim
+from p2gs.types import Camera, GaussianTensors, View
+
+FIELDS = 8  # a side: each half of a photograph shows something of every part
+
+
+@dataclass
+class ViewFitConfig:
+    """What may be wrong with single photographs.
+
+    gains, cameras: "auto" (photographs decide, once, when the share ``at`` of the phase is done) or "never".  again: gains are measured
+    anew at these shares.  levels: the size of the photographs that decide, pixels; judges: how
+    many.  steps: of a camera's fit to half a
+    photograph.  rate: of the cameras' Adam in internal units, falling to a hundredth.  least: share by which the other halves' errors
+    must fall.
+    """
+
+    gains: Literal["auto", "never"] = "never"
+    cameras: Literal["auto", "never"] = "never"
+    at: float = 0.35
+    again: list[float] = field(default_factory=lambda: [0.5, 0.7])
+    levels: list[int] = field(default_factory=lambda: [200])
+    judges: int = 16
+    steps: int = 10
+    rate: float = 1e-3
+    least: float = 0.02
+
+
+class RowAdam:
+    """Adam for a table of rows that are looked at one at a time (Kingma and Ba 2015, arXiv:1412.6980): a row's moments move with it alone.
+
+    table [V, D]: changed in place.  moments [V, 2 D + 1]: both, and the steps taken.
+    """
+
+    def __init__(self, table: Tensor, moments: Tensor):
+        self.table, self.moments = table, moments
+
+    def step(self, row: int, gradient: Tensor, rate: float) -> None:
+        d = len(gradient)
+        m = self.moments[row]
+        m[:d] = 0.9 * m[:d] + 0.1 * gradient
+        m[d:-1] = 0.99 * m[d:-1] + 0.01 * gradient**2
+        m[-1] += 1
+        self.table[row] -= rate * (m[:d] / (1 - 0.9 ** m[-1])) / ((m[d:-1] / (1 - 0.99 ** m[-1])).sqrt() + 1e-12)
+
+
+class ViewErrors(nn.Module):
+    """The errors of V photographs of one state: buffers, so that a checkpoint has them.
+
+    twists [V, 6] and log_gains [V, 3], float64; their means are zero.  on [2] bool: gains, cameras; decided: whether that is known.
+    """
+
+    def __init__(self, count: int):
+        super().__init__()
+        self.register_buffer("twists", torch.zeros(count, 6, dtype=torch.float64))
+        self.register_buffer("moments", torch.zeros(count, 13, dtype=torch.float64))
+        self.register_buffer("log_gains", torch.zeros(count, 3, dtype=torch.float64))
+        self.register_buffer("on", torch.zeros(2, dtype=torch.bool))
+        self.register_buffer("decided", torch.zeros((), dtype=torch.bool))
+        self._looked_at: tuple[int, Tensor] | None = None
+
+    def camera(self, index: int, camera: Camera) -> Camera:
+        """The photograph's camera, with a gradient by its twist that ``learn`` takes up; the very camera where cameras are off."""
+        self._looked_at = None
+        if not bool(self.on[1]):
+            return camera
+        twist = self.twists[index].clone().requires_grad_()
+        self._looked_at = index, twist
+        return replace(camera, viewmat=(camera.viewmat.double().cpu() @ se3.exp(twist.cpu())).to(camera.viewmat))
+
+    def learn(self, rate: float) -> None:
+        """One step of the camera that was looked at last, after the backward pass."""
+        if self._looked_at is None or self._looked_at[1].grad is None:
+            return
+        index, twist = self._looked_at
+        RowAdam(self.twists, self.moments).step(index, twist.grad, rate)
+        self.twists -= self.twists.mean(0)
+
+    def views(self, shots: list[View]) -> list[View]:
+        """The photographs without their gains, their cameras as they were."""
+        still = torch.eye(4, dtype=torch.float64).expand(len(shots), 4, 4)
+        return correct_views(shots, ViewCorrections(still, self.log_gains.cpu()))
+
+    def handed_over(self) -> ViewCorrections | None:
+        """What later stages need; None where all is off."""
+        if not bool(self.on.any()):
+            return None
+        return ViewCorrections(se3.exp(self.twists.cpu()), self.log_gains.float().cpu())
+
+
+@torch.no_grad()
+def measure_gains(g: GaussianTensors, views: TrainingViews, size: int, backend: str) -> Tensor:
+    """Natural logarithm [V, 3], float64, of how much brighter each photograph is than its rendering, mean zero; 0 where none can tell."""
+    found = torch.zeros(len(views), 3, dtype=torch.float64)
+    for index in range(len(views)):
+        shot = photograph(views, index, size, g.means.device)
+        out = render_gaussians(g, shot.camera, torch.full((3,), GREY).to(g.means), backend=backend)
+        gain = median_gain(shot.image, out.colour, (shot.alpha > 0.99) & (out.alpha > 0.99))
+        found[index] = 0 if gain is None else gain.double().cpu()
+    return found - found.mean(0)
+
+
+def halves(height: int, width: int) -> list[Tensor]:
+    """The two colours of a chessboard of ``FIELDS`` fields a side, [H, W] of 0 and 1 each."""
+    y, x = torch.arange(height) * FIELDS // height, torch.arange(width) * FIELDS // width
+    black = ((y[:, None] + x[None]) % 2).float()
+    return [black, 1 - black]
+
+
+@torch.no_grad()
+def try_gains(g: GaussianTensors, views: TrainingViews, config: ViewFitConfig, backend: str) -> Trial:
+    """Errors of half photographs without and with the gain that their other half tells, as it differs from the photographs' mean."""
+    drawn = []
+    for index in views.spread(config.judges):
+        shot = photograph(views, index, config.levels[0], g.means.device)
+        out = render_gaussians(g, shot.camera, torch.full((3,), GREY).to(g.means), backend=backend)
+        inside = (shot.alpha > 0.99) & (out.alpha > 0.99)
+        both = [half.to(g.means) for half in halves(*inside.shape)]
+        gains = [median_gain(shot.image, out.colour, inside & (half > 0)) for half in both]
+        if all(gain is not None for gain in gains):
+            drawn.append((shot.image, out.colour, inside, both, gains))
+    if len(drawn) < 2:
+        return trial(torch.ones(1), torch.ones(1))
+    mean = torch.stack([torch.stack(d[-1]).mean(0) for d in drawn]).mean(0)
+    errors = torch.zeros(2, len(drawn))
+    for k, (photo, colour, inside, both, gains) in enumerate(drawn):
+        for half, gain in zip(both, gains[::-1], strict=True):
+            seen = inside & (half > 0)
+            errors[0, k] += (photo[seen] - colour[seen]).abs().mean()
+            errors[1, k] += (photo[seen] - brightened(colour[seen], gain - mean)).abs().mean()
+    return trial(*errors)
+
+
+def try_cameras(g: GaussianTensors, views: TrainingViews, config: ViewFitConfig, backend: str) -> Trial:
+    """Errors of half photographs without and with the camera that fits their other half."""
+    g = g.detach()
+    errors = torch.zeros(2, min(config.judges, len(views)))
+    for k, index in enumerate(views.spread(config.judges)):
+        shot = photograph(views, index, config.levels[0], g.means.device)
+        both = [half.to(g.means) for half in halves(*shot.alpha.shape)]
+        for fitted, judged in zip(both, both[::-1], strict=True):
+            twist = fit_camera(g, shot, fitted, config, backend)
+            with torch.no_grad():
+                errors[0, k] += half_error(g, shot, judged, torch.zeros(6).double(), backend).cpu()
+                errors[1, k] += half_error(g, shot, judged, twist, backend).cpu()
+    return trial(*errors)
+
+
+def fit_camera(g: GaussianTensors, shot: TargetImage, half: Tensor, config: ViewFitConfig, backend: str) -> Tensor:
+    """The twist [6] with which a photograph's camera explains ``half`` [H, W] of it best; the Gaussians stay."""
+    table, moments = torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 13, dtype=torch.float64)
+    adam = RowAdam(table, moments)
+    for step in range(config.steps):
+        twist = table[0].clone().requires_grad_()
+        half_error(g, shot, half, twist, backend).backward()
+        adam.step(0, twist.grad, 2 * config.rate * 0.1 ** (step / config.steps))
+    return table[0]
+
+
+def half_error(g: GaussianTensors, shot: TargetImage, half: Tensor, twist: Tensor, backend: str) -> Tensor:
+    camera = replace(shot.camera, viewmat=(shot.camera.viewmat.double().cpu() @ se3.exp(twist)).to(shot.camera.viewmat))
+    out = render_gaussians(g, camera, torch.full((3,), GREY).to(g.means), backend=backend)
+    return l1_ssim(shot.image + half[..., None] * (out.colour - shot.image), shot.image, STRUCTURE)
