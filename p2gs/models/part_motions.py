@@ -41,7 +41,7 @@ class PartMotionsConfig:
     survey: shifts within its own surface tried for each part (internal units; [] = none).
     islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
     (0 = off).  rounds: how often labels, types and motions are settled anew.
-    reconsider: each part's motion, and one more, is searched again amid the others, refined; where the energy falls;
+    reconsider: each part's motion, and one more, is searched again amid the others, refined, and taken where the energy falls;
     missing_confidence, missing_evidence: confidence and evidence that a further part must have.
     split_reach: a part is tried as two whose motions differ by up to twice this (internal units; 0 = never) where that saves ``split``
     of its residual; also with a part left out whose evidence is below ``doubtful``. Where it saves ``split_fine``, amounts near each other

@@ -54,8 +54,8 @@ def reconsider(
     part anew and the states are re-rendered. A part may also be two of nearly one motion (``splits``), as it is or with a doubtful part
     left out: what moved by another amount than its neighbour is easily explained by a wild motion. Two whose motions hardly differ save
     little, and so do errors of one state: both directions must tell the difference alike. The best of each
-    kind is refined; the energy must fall. Junk
-    lowers it by as much as a small door does: with labels chosen anew, a further part's surface must also be found in both states
+    kind is refined; the energy must fall, and with a further part the image loss as well, by ``part_penalty``: where surfaces alone gain
+    it is junk. Junk lowers both by as much as a small door does: with labels chosen anew, a further part's surface must also be found in both states
     (discovery's confidence at least ``missing_confidence``) and the photographs must hold its joint where it is
     (``JointEvidence.confidence`` at least ``missing_evidence``).  Returns the motions and what was tried.
     """
@@ -93,7 +93,7 @@ def reconsider(
                 reached, refined = min((reached, refined), (cost_of(anew), anew), key=lambda t: t[0])
             value = energy(found, refined, reached)
             entry |= {"after": reached, "energy": value - lowest}
-            if value >= lowest:
+            if value >= lowest or (further and reached > cost * (1 - config.part_penalty)):
                 continue
             if change == "finely split":
                 pair = (part, len(motions))
