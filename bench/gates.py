@@ -2,20 +2,18 @@
 
     python bench/gates.py RUN... [--zoo DIR] [--out FILE] [--search]
 
-RUN holds the single states of a scene. (1, with --search) Is the energy at the true motions lower than at those discovery finds? (2) How far
+RUN holds the single states of a scene. (1, with --search) Is the energy at the true motions lower than at those that are found? (2) How far
 does refinement that starts at the true motions leave them? Every Gaussian has its best label under the motions. A line of JSON per run goes
 to FILE: displacement of each part's points (units of the object scaled to 1) and turn (degrees) away from the truth; energies.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import torch
-from ladder import Case, to_training
+from ladder import Case, runs_parser, to_training
 
 from p2gs.models.discovery import discover, relabel
 from p2gs.models.discovery.labels import Graph
@@ -87,11 +85,7 @@ def gates(case: Case, search: bool) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("runs", nargs="+", type=Path)
-    parser.add_argument("--zoo", type=Path, default=Path("../shared/zoo"))
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--threads", type=int, default=1)
+    parser = runs_parser(__doc__.splitlines()[0])
     parser.add_argument("--search", action="store_true", help="also the energies; needs the time of two discoveries")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)

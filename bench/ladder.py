@@ -113,12 +113,18 @@ class Case:
         return motions, time.perf_counter() - clock
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def runs_parser(about: str) -> argparse.ArgumentParser:
+    """Options of the benches that look at runs: RUN..., --zoo, --out, --threads."""
+    parser = argparse.ArgumentParser(description=about)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--zoo", type=Path, default=Path("../shared/zoo"))
     parser.add_argument("--out", type=Path)
     parser.add_argument("--threads", type=int, default=1)
+    return parser
+
+
+def main() -> None:
+    parser = runs_parser(__doc__.splitlines()[0])
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     for run in args.runs:

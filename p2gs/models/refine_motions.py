@@ -33,7 +33,7 @@ def sides_of(
 
     stacks: rendered depth of both states.
     """
-    seen = what_counts(states, motions, config, stacks, shown_alone=True, backend=backend, device=device)
+    seen = what_counts(states, motions, config, stacks, backend=backend, device=device)
     sides = []
     for s in (0, 1):
         g = states[s].gaussians
@@ -103,17 +103,17 @@ class Seen:
 
 
 def what_counts(
-    states, motions: PartMotions, config: PolishConfig, stacks: list[DepthStack], *, backend: str, shown_alone: bool = False, device="cpu"
+    states, motions: PartMotions, config: PolishConfig, stacks: list[DepthStack], *, backend: str, device="cpu"
 ) -> list[Seen]:
-    """Of both states, under these motions. Pixels count as far as they are not of surface that the other state hides, or (shown_alone) as far
-    as the other state shows what is in them; everything does where a tolerance of ``config`` is 0."""
+    """Of both states, under these motions. Pixels count as far as they are not of surface that the other state hides; everything does where
+    a tolerance of ``config`` is 0."""
     out = []
     for s in (0, 1):
         if config.free_static <= 0 or config.free_moving <= 0:
             out.append(Seen(torch.ones(len(motions.labels[s]), dtype=torch.bool), None))
             continue
         kept, shown = kept_and_shown(states, motions, s, stacks, config)
-        out.append(Seen(kept, ShownPixels(states[s], shown if shown_alone else shown | ~kept, backend, device)))
+        out.append(Seen(kept, ShownPixels(states[s], shown | ~kept, backend, device)))
     return out
 
 

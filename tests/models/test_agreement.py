@@ -2,17 +2,12 @@
 
 import pytest
 import torch
-from tiny import hinge, look_at, photographs, textured_panels
+from tiny import look_at
 
-from p2gs.data.views import TrainingViews
 from p2gs.models.agreement import ShownPixels, ends, kept_and_shown
-from p2gs.models.canonical import carry, with_static
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.joint_confidence import state_depth
-from p2gs.models.refine_motions import refine
 from p2gs.models.screw_polish import PolishConfig
-from p2gs.ops import se3
 from p2gs.types import GaussianTensors
 
 CONFIG = PolishConfig()
@@ -90,26 +85,3 @@ def test_pixels_of_hidden_surface_do_not_count_and_background_does():
     weight = ShownPixels(StateGaussians(0, g), ~left, "auto")(0, 0, look_at(torch.tensor([3.0, 0.0, 0.0]), 64))
     assert float(weight[:, :4].min()) == 1.0 and float(weight.min()) < 0.05  # beside it; on its hidden half
     assert 0.3 < float((weight > 0.9).float().mean()) < 0.98
-
-
-def test_a_face_that_one_state_alone_shows_no_longer_pulls_a_turn():
-    """In the end the panel goes on beyond what the start has of it, as a tray does that was shut."""
-    g, labels = textured_panels()
-    truth = hinge()
-    beyond = (labels == 1) & (g.means[:, 0] < -0.25)
-    more = g[beyond].clone()
-    more.means = more.means - torch.tensor([0.15, 0.0, 0.0])
-    whole, every = GaussianTensors.cat([g, more]), torch.cat([labels, labels[beyond]])
-    views = {
-        0: TrainingViews(photographs(g, labels, torch.eye(4).double(), 0), [64]),
-        1: TrainingViews(photographs(whole, every, truth, 1), [64]),
-    }
-    states = [StateGaussians(0, g), StateGaussians(1, carry(whole, every, with_static(truth[None])))]
-    stacks = [state_depth(s, views[s.state], 64) for s in states]
-    motions = PartMotions(["revolute"], truth[None], torch.ones(1), [labels, every], [torch.ones(len(labels)), torch.ones(len(every))])
-    centre, off = g.means[labels == 1].double().mean(0), {}
-    for tau in (0.0, 0.02):  # 0: everything has a say
-        config = PolishConfig(steps=120, levels=[64], level_starts=[0.0], rate=1e-2, free_static=tau)
-        found = refine(states, motions, views, config, stacks, seed=0, backend="auto").transforms
-        off[tau] = float((se3.apply(found[0], centre[None]) - se3.apply(truth, centre[None])).norm())
-    assert off[0.02] < 0.75 * off[0.0] and off[0.0] > 2e-3, off
