@@ -42,7 +42,7 @@ def test_commands_are_understood(page, desk):
         args, rest = parser().parse_known_args(words)
         if args.command == "fit":
             cfg = config_from(args, rest)
-            assert len(cfg.phases) == 6, words
+            assert len(cfg.phases) == 7, words
         elif args.command == "bench":
             assert not rest or rest[0].startswith(("--phases.", "--data.")), words
         else:
