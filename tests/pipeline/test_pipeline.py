@@ -75,7 +75,7 @@ def test_result_folder(folder):
 def test_a_finished_run_is_not_run_again(folder):
     before = (folder / "whole" / "twin.json").read_bytes()
     again = fit(folder, "--run", str(folder / "whole"))
-    assert again.returncode == 0 and again.stdout.count("done before") == 8, again.stdout + again.stderr
+    assert again.returncode == 0 and again.stdout.count("done before") == 9, again.stdout + again.stderr
     assert (folder / "whole" / "twin.json").read_bytes() == before
 
 
