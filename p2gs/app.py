@@ -54,6 +54,8 @@ def parser(prog: str = "p2gs") -> Parser:
     several = {"nargs": "+", "action": "extend", "default": []}
     fit.add_argument("-c", "--config", **several, metavar="FILE", help="YAML files, later ones laid on earlier ones")
     fit.add_argument("--only", metavar="PHASE", help="run this phase only (its predecessors must be there)")
+    told = "use results of stages as they are, though options, code or photographs that made them have changed"
+    fit.add_argument("--keep_stale", "--keep-stale", action="store_true", help=told)
     fit.add_argument("--print_config", action="store_true", help="print the merged config with all defaults and stop")
     fit.add_argument("--plugins", **several, metavar="MODULE", help="modules with losses, callbacks, ... of your own")
     fit.add_argument("--run", metavar="DIR", help="result folder (default runs/<scene>)")

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from p2gs.losses.base import Loss
 
 
+STAGES = ("single_state", "registration", "discovery", "sharpen", "canonical_fusion", "articulation", "finish")
+
+
 @dataclass
 class Options:
     """Top-level options of a run.
@@ -36,6 +39,7 @@ class Options:
     or auto.  num_parts: including the static base; auto finds out, and a number is the most that discovery may find.
     exact_parts: num_parts is the number of slots instead: of more parts found the alike become one, fewer get spare slots beside them.
     plugins: modules that register losses, callbacks, phases, ...
+    stages: phases in the order in which they run, each of which ``phases`` has to mention.
     strict_paths: files of the scene that lead out of its folder are refused; they are only named else.
     """
 
@@ -47,6 +51,7 @@ class Options:
     num_parts: Union[int, Literal["auto"]] = "auto"
     exact_parts: bool = False
     plugins: list[str] = field(default_factory=list)
+    stages: list[str] = field(default_factory=lambda: list(STAGES))
     strict_paths: bool = False
 
     def __post_init__(self):
@@ -87,7 +92,7 @@ class RunConfig:
         options: Options = build({name: values[name] for name in own.children}, own)
         self.seed, self.run, self.device, self.threads = options.seed, options.run, options.device, options.threads
         self.rasterizer, self.num_parts, self.plugins = options.rasterizer, options.num_parts, options.plugins
-        self.exact_parts, self.strict_paths = options.exact_parts, options.strict_paths
+        self.exact_parts, self.strict_paths, self.stages = options.exact_parts, options.strict_paths, options.stages
         self.data_options: Plain = values["data"]
         self._data: Optional[LightningDataModule] = None
         self.phases: dict[str, PhaseSection] = {}
@@ -130,6 +135,12 @@ class RunConfig:
     def run_dir(self) -> Path:
         """The result folder."""
         return Path(self.run) if self.run else Path("runs") / self.scene_name
+
+    def phase_config(self, name: str) -> Any:
+        """Options of a phase; their defaults where this config does not mention it. Raises UserError for an unknown name."""
+        from p2gs.models.phase import PHASES
+
+        return self.phases[name].config if name in self.phases else PHASES[name].Config()
 
     def section(self, name: str) -> Plain:
         """What decides the result of a phase (its fields, enabled losses, callbacks that change the result), or a top-level key.
@@ -286,6 +297,7 @@ def import_builtins() -> None:
         module = importlib.import_module(f"p2gs.{package}")
         for info in pkgutil.iter_modules(module.__path__):
             importlib.import_module(f"p2gs.{package}.{info.name}")
+    importlib.import_module("p2gs.runtime.stages")
 
 
 # -- saving ------------------------------------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ import torch
 
 from p2gs.config import RunConfig, load_config
 from p2gs.machine import is_of_the_machine, machine_says
+from p2gs.models.stage import PHASES
 from p2gs.run_lock import held
 from p2gs.stopping import EXIT_CODE, Terminated, heeding_sigterm
 from p2gs.types import UserError
@@ -28,15 +29,15 @@ MISTAKE = "error: "  # what a line starts with that tells a user's mistake
 PATIENCE = 60.0  # seconds to save the state in
 
 
-def can_run_beside(cfg: RunConfig, device: torch.device) -> bool:
-    """Whether the two single states can be trained at once: on a CPU, with two threads or more, nothing that wants a run for itself.
+def can_run_beside(cfg: RunConfig, device: torch.device, phase: str = "single_state") -> bool:
+    """Whether both states' runs of a phase can be trained at once: on a CPU, with two threads or more, nothing that wants a run for itself.
 
     A loss or callback that the running program registered itself (no plugin) is unknown to another process: then one after the other.
     """
-    section = cfg.phases["single_state"]
+    section = cfg.phases[phase]
     callbacks = section.new_callbacks().values()
     known = {"p2gs", *(name.removesuffix(".py").replace("/", ".") for name in cfg.plugins)}
-    makers = [type(x) for x in (cfg.data, section.config, *section.losses.values(), *callbacks)]
+    makers = [PHASES[phase], *(type(x) for x in (cfg.data, section.config, *section.losses.values(), *callbacks))]
     foreign = any(not any(f"{make.__module__}.".startswith(f"{name}.") for name in known) for make in makers)
     return device.type == "cpu" and torch.get_num_threads() > 1 and not foreign and not any(c.alone for c in callbacks)
 

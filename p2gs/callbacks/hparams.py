@@ -18,7 +18,7 @@ WHOLE = ("canonical", "repel")  # sections whose every value is shown
 
 @register_callback("families")
 class Families(Callback):
-    """The losses of a phase as one chart a family (photometric, geometry, parts, motion, physics, own), and joints and their errors beside.
+    """The losses of a phase as one chart a kind (image, prior, parts, motion, physics, own), and joints and their errors beside.
 
     Uses the tags that the callbacks ``scalars`` and ``evaluation`` write.
     """
@@ -31,17 +31,11 @@ class Families(Callback):
             add(layout(phase.phase_name, phase.losses))
 
 
-def family(loss: Any) -> str:
-    """The family of a loss: the module of ``p2gs.losses`` it is in, or ``own``."""
-    package, _, module = type(loss).__module__.rpartition(".")
-    return module if package == "p2gs.losses" else "own"
-
-
 def layout(phase_name: str, losses: dict[str, Any]) -> dict:
     """The layout for ``SummaryWriter.add_custom_scalars``: category -> chart -> ["Multiline", [regular expressions of tags]]."""
     charts: dict[str, list] = {"total": ["Multiline", [f"^{phase_name}/loss/total$"]]}
     for name, loss in losses.items():
-        charts.setdefault(family(loss), ["Multiline", []])[1].append(f"^{phase_name}/loss/{name}$")
+        charts.setdefault(loss.kind, ["Multiline", []])[1].append(f"^{phase_name}/loss/{name}$")
     out = {f"{phase_name}: losses": charts}
     if phase_name == "articulation":
         tags = {

@@ -43,6 +43,6 @@ def fit(args: argparse.Namespace, words: list[str]) -> int:
 
     silence_lightning()
     with heeding_sigterm():
-        result = pipeline.run(cfg, only=args.only)
+        result = pipeline.run(cfg, only=args.only, keep_stale=args.keep_stale)
     print(f"result: {result}")
     return 0

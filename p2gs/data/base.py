@@ -85,6 +85,7 @@ class TwoStateData(LightningDataModule):
         self.root: Optional[str] = root
         self.downscale, self.max_views = downscale, max_views
         self.depth, self.seed, self.normalize = depth, seed, normalize
+        self._files: Optional[list[Path]] = None
         self._raw: Optional[TwoStateScene] = None
         self._scene: Optional[TwoStateScene] = None
 
@@ -94,10 +95,22 @@ class TwoStateData(LightningDataModule):
         if not root.is_dir():
             raise UserError(f"{root}: scene folder is missing")
         report = StrictReport(root=root, strict=self.strict_paths)
-        frames = thin_out(self.index(root, report), self.max_views)
+        indexed = self.index(root, report)
+        frames = thin_out(indexed, self.max_views)
+        left_out = report.opened - {p.resolve() for f in indexed for p in f.files}
+        self._files = sorted(left_out | {p.resolve() for f in frames for p in f.files})
         views = read_views(frames, report, self.downscale, self.depth)
         check_sizes(frames, views, report)
         return TwoStateScene(root.resolve().name, tuple(views))
+
+    def files(self) -> list[Path]:
+        """The files that decide the scene, once it has been read: a run's stages are made again when one changes.
+
+        Where ``read`` is a subclass's own, every file below ``root``; override it where that is too much.
+        """
+        if self._files is not None or not self.root:
+            return self._files or []
+        return sorted(path for path in Path(self.root).resolve().rglob("*") if path.is_file())
 
     def index(self, root: Path, report: Report) -> list[Frame]:
         """The scene's frames (layouts on disk override this)."""

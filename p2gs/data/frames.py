@@ -42,6 +42,11 @@ class Frame:
     mask: Optional[Path] = None
     depth: Optional[Path] = None
 
+    @property
+    def files(self) -> list[Path]:
+        """Image, and mask and depth where they are files of their own."""
+        return [path for path in (self.image, self.mask, self.depth) if path is not None]
+
     def intrinsics(self, width: int, height: int) -> np.ndarray:
         """[3, 3] float64 for an image file of this size."""
         if self.K is not None:

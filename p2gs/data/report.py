@@ -30,6 +30,7 @@ class Report:
     findings: list[Finding] = field(default_factory=list)
     root: Optional[Path] = None
     strict: bool = False
+    opened: set[Path] = field(default_factory=set, repr=False)  # resolved; every file that was asked for
     _named: set[Path] = field(default_factory=set, repr=False)  # folders outside of the root that have been named
 
     def error(self, message: str) -> None:
@@ -48,6 +49,7 @@ class Report:
         once for each folder that such files lie in; where ``strict``, it is an error and False."""
         try:
             real = path.resolve()
+            self.opened.add(real)
             inside = self.root is None or real.is_relative_to(self.root.resolve())
         except (OSError, ValueError, RuntimeError):  # a ring of links, a name that no file can have: there is nothing to read
             return True

@@ -6,6 +6,7 @@ Write one in a file of your own::
 
     @register_loss("brightness")
     class Brightness(Loss):
+        needs = frozenset()  # looks at the render alone
         target: float = 0.5
 
         def compute(self, inputs: LossInputs):
@@ -17,16 +18,23 @@ and switch it on from YAML: ``losses: {brightness: {weight: 0.1}}``.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Optional
+from typing import ClassVar, Optional
 
 from torch import Tensor
 
 from p2gs.ops import se3
 from p2gs.ops.blend import part_motions
 from p2gs.registry import Registry
-from p2gs.types import Camera, GaussianTensors, RenderOutput
+from p2gs.types import Camera, GaussianTensors, RenderOutput, UserError
 
 LOSSES: Registry[type["Loss"]] = Registry("loss")
+NEEDS = {
+    "depth_sq": "RenderOutput.depth_sq",
+    "parts": "LossInputs.parts",
+    "pairs": "PartState.pairs, mu0, mu1: without observed pairs the loss is nothing",
+    "rotations": "PartState.target_rotation",
+}
+KINDS = ("image", "prior", "parts", "motion", "physics", "own")
 
 
 @dataclass
@@ -106,13 +114,31 @@ class Loss:
     weight: factor in the total.  start, end: active while start <= step / total_steps < end (fractions of the phase).
     end_weight: when given, the weight moves from ``weight`` to it, geometrically, between start and end.
     every: looked at in one step of so many, with its weight multiplied by that number: the same on average at a part of the cost.
+
+    Two class attributes tell a phase what to make. needs: of ``NEEDS``, what costs time and is made in steps where a loss asks for it
+    (``pairs`` and ``rotations`` include ``parts``; all else of ``LossInputs`` is always there).  kind: of ``KINDS``. The ``image`` losses,
+    which hold a render against its photograph, also fit the twin's Gaussians in the end; each kind has a chart in TensorBoard.
     """
+
+    needs: ClassVar[frozenset[str]] = frozenset({"parts"})
+    kind: ClassVar[str] = "own"
 
     weight: float = 1.0
     start: float = 0.0
     end: float = 1.0
     end_weight: Optional[float] = None
     every: int = 1
+
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        cls.needs = frozenset(cls.needs)
+        wrong = sorted(cls.needs - NEEDS.keys())
+        if wrong:
+            raise UserError(f"loss {cls.__name__}: needs '{wrong[0]}', which no phase makes; known: {', '.join(NEEDS)}")
+        if cls.kind not in KINDS:
+            raise UserError(f"loss {cls.__name__}: kind is '{cls.kind}', expected one of {', '.join(KINDS)}")
+        if cls.needs & {"pairs", "rotations"}:
+            cls.needs |= {"parts"}
 
     def active(self, step: int, total_steps: int) -> bool:
         return self.weight != 0 and step % self.every == 0 and self.start <= step / max(total_steps, 1) < self.end

@@ -18,6 +18,8 @@ class Depth(Loss):
     left out: their mean depth means little and its gradient is large.
     """
 
+    needs = frozenset()
+    kind = "image"
     weight: float = 0.5
     min_alpha: float = 0.1
 
@@ -39,6 +41,8 @@ class DepthVariance(Loss):
     the units of an object of unit size. None where the render carries no squared depth (``RenderOutput.depth_sq``).
     """
 
+    needs = frozenset({"depth_sq"})
+    kind = "prior"
     weight: float = 30.0
     end_weight: float | None = 10.0
 
@@ -59,6 +63,8 @@ class Planar(Loss):
     it can, and this carries the rim's depth inwards.
     """
 
+    needs = frozenset()
+    kind = "prior"
     weight: float = 0.1
     strides: tuple[int, ...] = (3, 9, 27)
     contrast: float = 0.1
@@ -79,6 +85,8 @@ class Flat(Loss):
     standard deviations, and training puts that right by pulling the surface inward. Flat ones have no rims.
     """
 
+    needs = frozenset()
+    kind = "prior"
     weight: float = 1.0
 
     def compute(self, inputs: LossInputs) -> Tensor:

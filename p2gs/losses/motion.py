@@ -74,6 +74,8 @@ class Vector(Loss):
     grows with the number of Gaussians.  sample: pairs looked at per step (0: all).  robust: see ``squared``; None is the paper.
     """
 
+    needs = frozenset({"pairs"})
+    kind = "motion"
     weight: float = 0.5
     reduce: Literal["mean", "sum"] = "mean"
     sample: int = 4096
@@ -108,6 +110,8 @@ class Art(Loss):
     min_prob: memberships below it feel no force (saves most of the work).  reduce, sample, robust: as in ``vector``.
     """
 
+    needs = frozenset({"pairs", "rotations"})
+    kind = "motion"
     weight: float = 1.0
     variant: Literal["local", "paper"] = "local"
     reduce: Literal["mean", "sum"] = "mean"

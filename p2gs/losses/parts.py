@@ -35,6 +35,8 @@ class Part(Loss):
     sample: M, Gaussians looked at per step (0: all).  reduce: the paper's mean over M, or the sum.
     """
 
+    needs = frozenset({"parts"})
+    kind = "parts"
     weight: float = 0.1
     variant: Literal["mean_neighbour", "pairwise"] = "mean_neighbour"
     sample: int = 4096
@@ -60,6 +62,8 @@ class Part(Loss):
 class Entropy(Loss):
     """Mean entropy of the part assignment in nats: makes labels sharp. Not in the paper, which leaves one-part-for-all a minimum."""
 
+    needs = frozenset({"parts"})
+    kind = "parts"
     weight: float = 0.01
 
     def compute(self, inputs: LossInputs) -> Tensor | None:

@@ -17,6 +17,8 @@ class Render(Loss):
     ssim_lambda: l. The paper does not state it; 0.2 is 3DGS's. Refining screws wants it higher (0.8): shading differs between states.
     """
 
+    needs = frozenset()
+    kind = "image"
     ssim_lambda: float = 0.2
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
@@ -32,6 +34,8 @@ class Alpha(Loss):
     eps: rendered alpha is clamped to [eps, 1 - eps], which bounds the gradient of a pixel.
     """
 
+    needs = frozenset()
+    kind = "image"
     weight: float = 0.05
     eps: float = 1e-4
 
@@ -48,6 +52,8 @@ class Opacity(Loss):
     Mean over Gaussians. ArtGS's regulariser of the single states (weight 0.1 there); not in the paper.
     """
 
+    needs = frozenset()
+    kind = "prior"
     weight: float = 0.1
 
     def compute(self, inputs: LossInputs) -> Tensor:

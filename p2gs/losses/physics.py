@@ -25,6 +25,8 @@ class Velocity(Loss):
     reduce: mean over the slots, or the paper's sum.  sample: pairs looked at per step (0: all).
     """
 
+    needs = frozenset({"pairs"})
+    kind = "physics"
     weight: float = 0.5
     variant: Literal["rigid", "paper"] = "rigid"
     reduce: Literal["mean", "sum"] = "mean"
@@ -57,6 +59,8 @@ class Contact(Loss):
     reduce: mean over the movable parts present, or the sum.  sample: movable Gaussians looked at per step (0: all).
     """
 
+    needs = frozenset({"parts"})
+    kind = "physics"
     weight: float = 0.5
     variant: Literal["margin", "paper"] = "margin"
     reduce: Literal["mean", "sum"] = "mean"

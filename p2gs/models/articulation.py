@@ -10,6 +10,7 @@ from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs, PartState
 from p2gs.models.canonical import carry
+from p2gs.models.context import RunContext
 from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
 from p2gs.models.motion import PartScrews, blend_move, initial_screws
 from p2gs.models.observed_pairs import ObservedPairs
@@ -22,9 +23,6 @@ from p2gs.models.splats import Splats
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors, UserError
-
-IMAGE_LOSSES = ("render", "alpha", "depth", "depth_variance", "planar", "opacity")  # they look at no part state, which costs time to make
-
 
 @dataclass
 class RepelConfig:
@@ -77,12 +75,9 @@ class ArticulationConfig(ImageConfig):
     repel: RepelConfig = field(default_factory=RepelConfig)
 
 
-NEED_PAIRS = ("art", "velocity", "vector")  # they look at observed pairs and vanish without
-
-
 def check_losses(config: ArticulationConfig, losses: dict[str, Loss], canonical: CanonicalGaussians) -> None:
     """Raises UserError where losses that are switched on would be nothing, without a word."""
-    vanish = [name for name in NEED_PAIRS if name in losses and losses[name].weight != 0]
+    vanish = [name for name, loss in losses.items() if "pairs" in loss.needs and loss.weight != 0]
     late = config.pair_target != "nearest" or config.nearest_from > 0
     if vanish and late and not bool(canonical.paired.any()):
         raise UserError(
@@ -98,6 +93,20 @@ class ArticulationPhase(ImagePhase):
     """L = L_render + l_part L_part + l_art L_art + l_phys (L_contact + L_velocity + L_vector), over both states."""
 
     Config = ArticulationConfig
+    needs = ("states", "canonical")
+    uses = ("sharpened", "motions")
+    gives = "learned"
+
+    @classmethod
+    def build(cls, run: RunContext, section, *, states, canonical, sharpened=None, motions=None) -> "ArticulationPhase":
+        if motions is None and section.config.init == "discovery":
+            raise UserError(
+                "phases.articulation.init: discovery needs 'motions', which no stage hands over; add discovery to stages, or give --num_parts N "
+                "and init: random or identity"
+            )
+        parts = len(motions) + 1 if motions is not None and not run.exact else run.num_parts
+        states = sharpened or states
+        return cls(section.config, section.losses, canonical, states, motions, parts, run.extent, run.views, **run.common())
 
     def __init__(
         self,
@@ -172,8 +181,8 @@ class ArticulationPhase(ImagePhase):
             moved = moved.placed(moved.means + (1 - probs[:, :1]) * self.repel_force(moved.means, step), moved.quats)
         render = self.render(moved, camera, target.background)
         self.refresh(step, g, probs)
-        due = any(loss.active(step, self.total_steps) for name, loss in self.losses.items() if name not in IMAGE_LOSSES)
-        return LossInputs(step, self.total_steps, g, render, target, camera, self.part_state(g, probs) if due else None, self.loss_cache)
+        parts = self.part_state(g, probs) if self.needed("parts") else None
+        return LossInputs(step, self.total_steps, g, render, target, camera, parts, self.loss_cache)
 
     def repel_force(self, points: Tensor, step: int) -> Tensor:
         """The force of the loss ``art`` at points [N, 3] of any state (the repel points lie on the base, which does not move)."""
@@ -195,7 +204,7 @@ class ArticulationPhase(ImagePhase):
         if self._pairs is None or not self._pairs.are_of(*observed):
             self._pairs = ObservedPairs(*observed)
         pairs, target_rotation = self._pairs, None
-        if self._active("art") and pairs.index.numel() >= 3:
+        if self.needed("rotations") and pairs.index.numel() >= 3:
             target_rotation = pairs.rotations(probs)
         hardness = (self.config.temperature - self.temperature(self.step)) / max(
             self.config.temperature - self.config.temperature_end, 1e-9

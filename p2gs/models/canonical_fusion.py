@@ -9,10 +9,12 @@ from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.canonical import CanonicalConfig, fuse, keep_rows, with_static
+from p2gs.models.context import RunContext
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.free_space import SURFACE, explain_by_free_space, hidden_share
 from p2gs.models.handover import CanonicalGaussians, PartMotions, StateGaussians
-from p2gs.models.openings import OpeningsConfig
+from p2gs.models.openings import OpeningsConfig, open_up
+from p2gs.models.owners import hidden_to_owners
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
 from p2gs.models.splats import Splats
@@ -41,6 +43,30 @@ class CanonicalFusionPhase(ImagePhase):
     """Gaussians at canonical time, seen in both states through motions that are held fixed: discovered screws, or matched chords."""
 
     Config = CanonicalFusionConfig
+    needs = ("states",)
+    uses = ("sharpened", "motions")
+    gives = "canonical"
+
+    @classmethod
+    def build(cls, run: RunContext, section, *, states, sharpened=None, motions=None) -> "CanonicalFusionPhase":
+        """``states`` tell what free space says: an overfitted lid explains noise that no wall behind it does."""
+        found_in, states, stacks, counted = states, sharpened or states, None, {}
+        if motions is not None and len(motions) and section.config.canonical.free_space > 0:
+            backend = {"backend": run.rasterizer, "device": run.device}
+            stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in run.evidence(found_in)]
+            if section.config.owners:
+                motions, counted["owners"] = hidden_to_owners(found_in, motions, stacks, **backend)
+            train = run.scene.select(split="train")
+            told = any(v.depth is not None for v in train)  # where depth is given nothing is open
+            if section.config.openings.may_lose > 0 and not told:
+                openings, motions, stacks, lids = open_up(found_in, motions, run.views, stacks, section.config.openings, **backend)
+                states = [opening.of(s) for opening, s in zip(openings, states, strict=True)]
+                counted["openings"] = lids
+                gone, come = (sum(c[k] for c in lids) for k in ("removed", "added"))
+                run.log(cls.phase_name, f"{gone} Gaussians before openings gave way to {come} on the walls behind them")
+        known = None if run.num_parts == "auto" else run.num_parts
+        options = {"stacks": stacks, "counted": counted, "num_parts": known, **run.common()}
+        return cls(section.config, section.losses, states, motions, run.views, **options)
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from p2gs.models.discovery import StateEvidence
-from p2gs.models.single_state import render_gaussians
+from p2gs.models.draw import render_gaussians
 from p2gs.types import Camera, GaussianTensors, View
 
 

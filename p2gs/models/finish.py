@@ -16,7 +16,6 @@ from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.islands import settle_twin_islands
 from p2gs.models.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.models.joint_range import extend_ranges
-from p2gs.models.phase import PHASES
 from p2gs.models.refine_motions import leave_false_minima, refine, single_ways
 from p2gs.models.screw_polish import PolishConfig, photometric_cost
 from p2gs.models.tune import TuneConfig, tune
@@ -84,14 +83,6 @@ class FinishRecord:
     evidence: list[JointEvidence] = field(default_factory=list)
     slots: list[int] = field(default_factory=list)
     contents: int = 0
-
-
-@PHASES.register("finish")
-class FinishStage:
-    """A stage without training: no losses, no callbacks."""
-
-    Config = FinishConfig
-    trained = False
 
 
 def majority(labels: Tensor, neighbours: Tensor, weights: Tensor, parts: int) -> tuple[Tensor, Tensor]:

@@ -125,8 +125,20 @@ class Articulation:
         return self.probs.argmax(dim=1)
 
 
-_HANDED_OVER = (GaussianTensors, ViewCorrections, StateGaussians, Registration, PartMotions, CanonicalGaussians, Articulation)
-_CLASSES = {c.__name__: c for c in _HANDED_OVER}
+_BUILT_IN = (GaussianTensors, ViewCorrections, StateGaussians, Registration, PartMotions, CanonicalGaussians, Articulation)
+_CLASSES = {c.__name__: c for c in _BUILT_IN}
+
+
+def handed_over(cls: type) -> type:
+    """Decorator for a dataclass that a phase of your own hands over: fields are tensors, numbers, text, lists, dicts or other such classes.
+
+    Raises ValueError where the class's name is taken.
+    """
+    known = _CLASSES.setdefault(cls.__name__, cls)
+    if known.__qualname__ != cls.__qualname__ or known.__module__ != cls.__module__:
+        raise ValueError(f"handed_over: there is another class {cls.__name__}, {known.__module__}.{known.__qualname__}")
+    _CLASSES[cls.__name__] = cls
+    return cls
 
 
 def _pack(value):

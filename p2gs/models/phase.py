@@ -17,22 +17,12 @@ from p2gs.models.adam import NamedAdam
 from p2gs.models.health import check_gaussians, check_loss
 from p2gs.models.splats import Splats
 from p2gs.native import serial_torch
-from p2gs.registry import Registry
+from p2gs.models.stage import PHASES, Stage, register_phase
 from p2gs.render import draws_natively
 from p2gs.stopping import leave_if_asked
 from p2gs.types import UserError
 
-PHASES: Registry[type["Phase"]] = Registry("phase")
-
-
-def register_phase(name: str):
-    """Decorator: register a phase and tell it its name."""
-
-    def wrap(cls: type["Phase"]) -> type["Phase"]:
-        cls.phase_name = name
-        return PHASES.register(name)(cls)
-
-    return wrap
+__all__ = ["PHASES", "Phase", "PhaseConfig", "Stage", "exponential", "register_phase"]
 
 
 @dataclass
@@ -59,10 +49,10 @@ def exponential(start: float, end: float, fraction: float) -> float:
     return math.exp(math.log(start) + (math.log(end) - math.log(start)) * min(max(fraction, 0.0), 1.0))
 
 
-class Phase(LightningModule):
+class Phase(LightningModule, Stage):
     """One training phase. Owns its Gaussians, rasterizer and whatever else it learns; hands over a small saved object.
 
-    Subclasses give ``parameter_groups`` (name -> (tensors, learning rate)), ``learning_rates(step)`` and ``inputs(step)``; the
+    Subclasses give ``build`` (see ``models.stage``), ``parameter_groups`` (name -> (tensors, learning rate)), ``learning_rates(step)`` and ``inputs(step)``; the
     sum of the losses on those inputs is minimised with one Adam. Which losses are on is the config's business.
 
     losses: name -> Loss.  scalars: latest detached values by name, for callbacks to log.  seed: makes every random choice a
@@ -70,6 +60,7 @@ class Phase(LightningModule):
     """
 
     Config: type[PhaseConfig] = PhaseConfig
+    trained = True
     phase_name = "phase"
 
     def __init__(self, config: PhaseConfig, losses: dict[str, Loss], *, seed: int = 0, rasterizer: str = "auto"):
@@ -118,6 +109,10 @@ class Phase(LightningModule):
     @property
     def total_steps(self) -> int:
         return self.config.steps
+
+    def needed(self, what: str) -> bool:
+        """Whether a loss that is due in this step asks for ``what`` (of ``losses.base.NEEDS``)."""
+        return any(what in loss.needs and loss.active(self.step, self.total_steps) for loss in self.losses.values())
 
     @property
     def num_gaussians(self) -> int:

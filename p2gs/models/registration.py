@@ -8,6 +8,7 @@ would have it in them. The motion with the widest support near the identity is t
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import torch
@@ -15,12 +16,13 @@ from torch import Tensor
 
 from p2gs.data.exposure import median_gain
 from p2gs.data.views import TargetImage, TrainingViews
+from p2gs.models.context import RunContext
 from p2gs.models.discovery.evidence import DepthStack, StateEvidence
 from p2gs.models.discovery.surfels import build_surfels
 from p2gs.models.handover import Registration, StateGaussians
-from p2gs.models.phase import PHASES
 from p2gs.models.photo_fit import COLOUR, STRUCTURE, PhotoSide, compare, fit_photographs, photograph, unmoved
-from p2gs.models.registered import dimmed
+from p2gs.models.registered import REGISTRATION, dimmed, register_state, register_views, write_registration
+from p2gs.models.stage import Stage, register_phase
 from p2gs.models.surface_fit import fit_surfaces
 from p2gs.models.trial import held_out, trial
 from p2gs.ops import se3, so3
@@ -144,9 +146,23 @@ class Pair:
         return torch.stack([compare(sides[k], shot, weight, transform, self.backend, ssim_lambda) for k, shot, weight in shots]).cpu()
 
 
-@PHASES.register("registration")
-class RegistrationStage:
-    """A stage without training: no losses, no callbacks."""
+@register_phase("registration")
+class RegistrationStage(Stage):
+    """A phase without training: no losses, no callbacks."""
 
     Config = RegistrationConfig
-    trained = False
+    needs = ("states",)
+    gives = "states"
+    num_parts_matters = False
+
+    @classmethod
+    def compute(cls, run: RunContext, section, *, states: list[StateGaussians]) -> Registration:
+        say = partial(run.log, cls.phase_name)
+        return align_states(states, run.evidence(states), run.views, run.scene.box, section.config, run.rasterizer, say)
+
+    @classmethod
+    def hand_on(cls, run: RunContext, value: Registration, *, states: list[StateGaussians]) -> dict:
+        """The states in the start's frame; so are scene and views from here on."""
+        write_registration(run.run_dir / REGISTRATION, value, states, run.scene_as_read)
+        run.take(register_views(run.scene, value))
+        return {cls.gives: [register_state(s, value) for s in states]}

@@ -14,6 +14,7 @@ from typing import Literal
 
 from p2gs.data.views import TrainingViews
 from p2gs.losses.base import Loss, LossInputs
+from p2gs.models.context import RunContext
 from p2gs.models.handover import StateGaussians
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, SplatRates, StatePhase
@@ -44,7 +45,15 @@ class SharpenPhase(StatePhase):
     """One state's Gaussians, all of them and in their order: labels of discovery stay theirs."""
 
     Config = SharpenConfig
+    needs = ("states",)
+    gives = "sharpened"
+    each_state = True
+    num_parts_matters = False
     picture_name = "sharpen"
+
+    @classmethod
+    def build(cls, run: RunContext, section, *, states: list[StateGaussians], state: int) -> "SharpenPhase":
+        return cls(section.config, section.losses, states[state], run.views_of(state), **run.common())
 
     def __init__(self, config: SharpenConfig, losses: dict[str, Loss], state: StateGaussians, views: TrainingViews, **common):
         super().__init__(config, losses, state.state, views, **common)

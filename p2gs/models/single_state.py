@@ -11,11 +11,13 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
 from p2gs.losses.base import Loss, LossInputs, Target
+from p2gs.models.context import RunContext
 from p2gs.models.draw import render_gaussians
 from p2gs.models.handover import StateGaussians
 from p2gs.models.health import check_gaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
 from p2gs.models.phase import Phase, PhaseConfig, exponential, register_phase
+from p2gs.models.registered import correct_scene
 from p2gs.models.splats import Splats
 from p2gs.models.view_fit import ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
 from p2gs.models.visibility import visible_share
@@ -124,13 +126,10 @@ class ImagePhase(Phase):
             camera,
             background,
             sh_degree=sh_degree,
-            depth_sq=self._active("depth_variance"),
+            depth_sq=self.needed("depth_sq"),
             absgrad=self.track_gradients,
             backend=self.rasterizer,
         )
-
-    def _active(self, name: str) -> bool:
-        return name in self.losses and self.losses[name].active(self.step, self.total_steps)
 
 
 class StatePhase(ImagePhase):
@@ -164,6 +163,20 @@ class SingleStatePhase(StatePhase):
     """3DGS of one state: L_render (paper Eq. 4) plus the losses the config names."""
 
     Config = SingleStateConfig
+    gives = "states"
+    each_state = True
+    num_parts_matters = False
+
+    @classmethod
+    def build(cls, run: RunContext, section, *, state: int) -> "SingleStatePhase":
+        options = {"seed": run.seed, "rasterizer": run.rasterizer}
+        return cls(section.config, section.losses, run.scene, state, run.views_of(state), **options)
+
+    @classmethod
+    def hand_on(cls, run: RunContext, value: list[StateGaussians]) -> dict:
+        """Cameras and exposures of training photographs are from here on as the states found them."""
+        run.take(correct_scene(run.scene_as_read, value))
+        return {cls.gives: value}
 
     def __init__(
         self, config: SingleStateConfig, losses: dict[str, Loss], scene: TwoStateScene, state: int, views: TrainingViews, **common

@@ -22,9 +22,6 @@ from p2gs.ops.carry import RigidMoves
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
 
-PICTURE_LOSSES = ("render", "alpha", "depth")  # priors on surfaces have had their say, and cost more PSNR here than they gain in shape
-
-
 @dataclass
 class TuneConfig:
     """Options of the last fit of the Gaussians. steps: over both states, in turn (0 = off).  levels: image sizes (long edge, pixels), of
@@ -50,11 +47,12 @@ def tune(
 ) -> GaussianTensors:
     """The Gaussians (at canonical ``time``) fitted to the photographs of both states under fixed motions.
 
-    labels [N]; transforms [K-1, 4, 4] start -> end; views: photographs by state; losses: of these the ones that hold a picture against a
-    photograph count; without "render" nothing changes.  Returns new Gaussians, detached, on the CPU.
+    labels [N]; transforms [K-1, 4, 4] start -> end; views: photographs by state; losses: of these the ones of kind ``image`` count; without
+    any nothing changes.  Returns new Gaussians, detached, on the CPU.
     """
-    losses = {name: loss for name, loss in losses.items() if name in PICTURE_LOSSES}
-    if config.steps <= 0 or "render" not in losses or len(gaussians) == 0:
+    # priors on surfaces have had their say, and cost more PSNR here than they gain in shape
+    losses = {name: loss for name, loss in losses.items() if loss.kind == "image"}
+    if config.steps <= 0 or not losses or len(gaussians) == 0:
         return gaussians
     splats, labels = Splats(gaussians).to(device), labels.to(device)
     moves = [RigidMoves(labels, se3.screw_at(transforms, state - time).to(device)) for state in (0, 1)]
@@ -75,7 +73,8 @@ def tune(
         target = Target(shot.image.to(device), shot.alpha.to(device), background, depth)
         g = splats.tensors()
         posed = g.placed(*moves[state](g.means, g.quats))
-        render = render_gaussians(posed, camera, background, backend=backend)
+        depth_sq = any("depth_sq" in loss.needs for loss in losses.values())
+        render = render_gaussians(posed, camera, background, depth_sq=depth_sq, backend=backend)
         inputs = LossInputs(step, config.steps, g, render, target, camera, cache=cache)
         values = [value for value in (loss(inputs) for loss in losses.values()) if value is not None]
         optimizer.zero_grad(set_to_none=True)

@@ -1,0 +1,1 @@
+"""Runs the stages in order: what each needs and hands over, keys, training, resuming."""

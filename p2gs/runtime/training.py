@@ -1,0 +1,70 @@
+"""One training phase with a Lightning Trainer of its own, from its checkpoint where it was interrupted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Optional
+
+import torch
+from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.environments import LightningEnvironment
+
+from p2gs.models.context import RunContext
+from p2gs.models.phase import Phase
+from p2gs.models.sealed import check_seal
+from p2gs.models.stage import Stage
+from p2gs.stopping import at_step_ends
+
+
+def train(run: RunContext, cls: type[Stage], stage: str, section: Any, key: str, given: dict) -> Any:
+    """What the phase hands over. stage: its name in the result folder (``single_state_0``).  section: its part of the config."""
+    seed_everything(run.seed, verbose=False)
+    phase: Phase = cls.build(run, section, **given)
+    phase.phase_name = stage
+    phase.save_hyperparameters({"stage": stage, "key": key})
+    callbacks = section.new_callbacks()
+    for callback in callbacks.values():
+        callback.prepare(run.cfg, run.scene)
+    order = sorted(callbacks, key=lambda n: (not callbacks[n].changes_result, n == "checkpoint"))
+    if phase.total_steps <= 0:
+        return phase.hand_over()
+    trainer = Trainer(
+        max_steps=phase.total_steps,
+        max_epochs=-1,
+        accelerator="gpu" if run.device.type == "cuda" else "cpu",
+        devices=1,
+        logger=TensorBoardLogger(run.run_dir / "logs", name=stage, version="", default_hp_metric=False),
+        callbacks=[callbacks[n] for n in order],
+        default_root_dir=run.run_dir,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=False,
+        num_sanity_val_steps=0,
+        plugins=[LightningEnvironment()],  # on SLURM, too: a run is one process, and resumes from its own checkpoints alone
+    )
+    with at_step_ends():
+        trainer.fit(phase, ckpt_path=resumable(run.run_dir, stage, key), weights_only=True)
+    if trainer.global_step < phase.total_steps:
+        raise KeyboardInterrupt
+    return phase.cpu().hand_over()
+
+
+def resumable(run_dir: Path, stage: str, key: str) -> Optional[str]:
+    """The training state an interrupted stage goes on from, when it is of this very key."""
+    path = run_dir / "checkpoints" / f"{stage}.ckpt"
+    if not path.exists():
+        return None
+    try:
+        check_seal(path)
+        stored = torch.load(path, weights_only=True)["hyper_parameters"]
+    except OSError:
+        raise
+    except Exception as err:
+        print(f"{stage}: {path} is damaged ({err}); starting this stage anew", flush=True)
+        return None
+    if stored.get("key") != key:
+        print(f"{stage}: {path} is of other options, code or photographs; starting this stage anew", flush=True)
+        return None
+    print(f"{stage}: going on from {path}", flush=True)
+    return str(path)
