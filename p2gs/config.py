@@ -297,7 +297,8 @@ def import_builtins() -> None:
         module = importlib.import_module(f"p2gs.{package}")
         for info in pkgutil.iter_modules(module.__path__):
             importlib.import_module(f"p2gs.{package}.{info.name}")
-    importlib.import_module("p2gs.runtime.stages")
+    for stage in ("discovery", "finish"):
+        importlib.import_module(f"p2gs.runtime.{stage}")
 
 
 # -- saving ------------------------------------------------------------------------------------------------------------------------

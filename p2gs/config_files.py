@@ -101,6 +101,18 @@ def read_config(name: str, beside: Optional[Path] = None, parents: tuple[Path, .
     return [*layers, Layer(tree, f"{path}: ")]
 
 
+def run_values(run_dir: Path | str) -> Plain:
+    """RUN/config.yaml as plain values, {} where there is none. Raises UserError where that file is no readable YAML."""
+    path = Path(run_dir) / "config.yaml"
+    if not path.is_file():
+        return {}
+    try:
+        values = yaml.safe_load(path.read_text())
+    except _UNREADABLE as err:
+        raise UserError(f"{path} is not readable YAML: {err}") from err
+    return values if isinstance(values, dict) else {}
+
+
 def _stay_inside(path: Path, parents: tuple[Path, ...], strict: bool) -> None:
     real = path.resolve()
     if any(real.is_relative_to(folder.resolve()) for folder in (parents[0].parent, *config_folders())):

@@ -20,6 +20,7 @@ ORDER = [
     ("models",),
     ("export", "callbacks"),
     ("config",),
+    ("runtime",),
     ("pipeline", "side_stage", "bench"),
     ("app", "commands"),
     ("cli", "__main__"),

@@ -25,8 +25,7 @@ from typing import Iterator, Optional, Sequence
 from p2gs.bench.plan import Cell
 
 PROGRAM = (sys.executable, "-m", "p2gs")
-# stages that a run can take over from another setting's run of the same object and seed
-SHARED = ("single_state_0", "single_state_1", "registration", "discovery", "sharpen_0", "sharpen_1", "canonical_fusion", "articulation")
+OWN = ("finish",)  # stages whose files beside the checkpoint are the run's own: never taken over from another setting's run
 
 
 _children: set[subprocess.Popen] = set()
@@ -167,11 +166,11 @@ def take_over(cell: Cell) -> None:
     """Copy finished stages of earlier settings; fit itself checks that their config is the one it would use."""
     own = Path(cell.run)
     for donor in map(Path, reversed(cell.donors)):
-        found = [donor / "checkpoints" / f"{name}.pt" for name in SHARED]
-        if not is_finished(donor) or not any(p.is_file() for p in found):
+        found = [p for p in sorted((donor / "checkpoints").glob("*.pt")) if p.stem not in OWN]
+        if not is_finished(donor) or not found:
             continue
         (own / "checkpoints").mkdir(parents=True, exist_ok=True)
-        for path in filter(Path.is_file, found):
+        for path in found:
             shutil.copyfile(path, own / "checkpoints" / path.name)
         if (donor / "logs" / "stages.json").is_file():  # so that the run's time counts the stages it took over
             (own / "logs").mkdir(exist_ok=True)

@@ -68,6 +68,7 @@ class RayOptions:
 class BenchOptions:
     """Options of a bench beside its settings; see the module. export: formats written between fit and test (meshes are scored).
 
+    format: of a data format of the user's own; every folder right below root is then a scene, named by its folder.
     preset: taken instead of the presets among ``config``, a name in configs/preset or a file; results go to a folder of their own.
     num_parts: of the settings that say nothing of it (the literal preset finds no number: gt).
     reuse: a run takes over finished stages of the same object and seed from the settings before it; stages whose config differs are
@@ -80,6 +81,7 @@ class BenchOptions:
     out: Optional[str] = None
     root: str = "."
     objects: Optional[list[str]] = None
+    format: Optional[str] = None
     config: list[str] = field(default_factory=lambda: ["preset/cpu.yaml"])
     preset: Optional[str] = None
     num_parts: Optional[Union[int, str]] = None
@@ -266,6 +268,9 @@ def find_scenes(options: BenchOptions) -> Iterator[Scene]:
     root = Path(options.root)
     if not root.is_dir():
         raise UserError(f"root: there is no folder {root} (--root DIR names the tree that holds the objects)")
+    if options.format is not None:
+        yield from own_scenes(root, options.format, options.objects)
+        return
     if options.objects is None:
         yield from local_scenes(root)
         return
@@ -287,6 +292,15 @@ def find_scenes(options: BenchOptions) -> Iterator[Scene]:
                 yield Scene(o.id, o.column, str(where.root), where.format, where.source, o.parts)
     if missing:
         raise UserError(f"{root}: lacks {', '.join(missing)} (p2gs data prepare {root} says more; --objects names fewer)")
+
+
+def own_scenes(root: Path, format: str, objects: Optional[list[str]]) -> Iterator[Scene]:
+    """The folders right below ``root`` (those named by ``objects``), as scenes of a format of the user's own. Raises UserError."""
+    folders = {path.name: path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")}
+    for name in folders if objects is None else objects:
+        if name not in folders:
+            raise UserError(f"objects: {root} has no folder '{name}'{suggest(name, folders)}")
+        yield Scene(name, name, str(folders[name]), format)
 
 
 def local_scenes(root: Path) -> Iterator[Scene]:

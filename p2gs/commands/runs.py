@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from p2gs.config_files import run_values
+from p2gs.registry import load_plugins
 from p2gs.types import UserError
 
 
@@ -18,7 +20,17 @@ def finished_run(folder: str) -> Path:
         begun = (path / "config.yaml").is_file()
         why = "the fit has not finished (give its command again)" if begun else "it is no result folder of p2gs fit"
         raise UserError(f"{path}: has no twin.json: {why}")
+    load_run_plugins(path)
     return path
+
+
+def load_run_plugins(run: Path) -> None:
+    """Import what the fit imported: a rasterizer of the user's own draws the run's pictures, too. Raises UserError where it cannot be."""
+    named = run_values(run).get("plugins") or []
+    try:
+        load_plugins(tuple(map(str, named if isinstance(named, list) else [named])))
+    except UserError as err:
+        raise UserError(f"{err}; {run / 'config.yaml'} names it: start p2gs where it lies, or have its folder on PYTHONPATH") from err
 
 
 def test(args: argparse.Namespace) -> int:

@@ -13,12 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from p2gs.config_files import run_values
 from p2gs.export.pose import part_transform
 from p2gs.ops.palette import part_colour, part_colours
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
 from p2gs.render import rasterize
 from p2gs.render.base import split_backend
-from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, RenderOutput, UserError
+from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, RenderOutput
 
 RASTERIZER: ContextVar[str] = ContextVar("rasterizer", default="auto")
 
@@ -42,16 +43,7 @@ def rasterizer_of(run_dir: Path | str) -> Iterator[str]:
 
 def run_rasterizer(run_dir: Path | str) -> str:
     """``rasterizer`` of RUN/config.yaml. Raises UserError where that file is no readable YAML."""
-    import yaml
-
-    path = Path(run_dir) / "config.yaml"
-    if not path.is_file():
-        return "auto"
-    try:
-        config = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as err:
-        raise UserError(f"{path} is not readable YAML: {err}") from err
-    return str((config or {}).get("rasterizer", "auto")) if isinstance(config, dict) else "auto"
+    return str(run_values(run_dir).get("rasterizer", "auto"))
 
 
 def draw(

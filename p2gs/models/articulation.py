@@ -77,7 +77,7 @@ class ArticulationConfig(ImageConfig):
 
 def check_losses(config: ArticulationConfig, losses: dict[str, Loss], canonical: CanonicalGaussians) -> None:
     """Raises UserError where losses that are switched on would be nothing, without a word."""
-    vanish = [name for name, loss in losses.items() if "pairs" in loss.needs and loss.weight != 0]
+    vanish = sorted(name for name, loss in losses.items() if "pairs" in loss.needs and loss.weight != 0)
     late = config.pair_target != "nearest" or config.nearest_from > 0
     if vanish and late and not bool(canonical.paired.any()):
         raise UserError(

@@ -11,6 +11,7 @@ from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.canonical import CanonicalConfig, fuse, keep_rows, with_static
 from p2gs.models.context import RunContext
 from p2gs.models.discovery.evidence import DepthStack
+from p2gs.models.evidence import evidence_of
 from p2gs.models.free_space import SURFACE, explain_by_free_space, hidden_share
 from p2gs.models.handover import CanonicalGaussians, PartMotions, StateGaussians
 from p2gs.models.openings import OpeningsConfig, open_up
@@ -53,7 +54,7 @@ class CanonicalFusionPhase(ImagePhase):
         found_in, states, stacks, counted = states, sharpened or states, None, {}
         if motions is not None and len(motions) and section.config.canonical.free_space > 0:
             backend = {"backend": run.rasterizer, "device": run.device}
-            stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in run.evidence(found_in)]
+            stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in evidence_of(run, found_in)]
             if section.config.owners:
                 motions, counted["owners"] = hidden_to_owners(found_in, motions, stacks, **backend)
             train = run.scene.select(split="train")

@@ -9,8 +9,6 @@ from typing import Any
 import torch
 
 from p2gs.data.views import TrainingViews
-from p2gs.models.discovery.evidence import StateEvidence
-from p2gs.models.evidence import gather_evidence
 from p2gs.types import TwoStateScene, UserError
 
 
@@ -96,13 +94,6 @@ class RunContext:
             sizes = set().union(*(levels_of(self.cfg.phases[name].config) for name in self.cfg.stages))
             self._views[state] = TrainingViews(views, sorted(sizes))
         return self._views[state]
-
-    def evidence(self, states) -> list[StateEvidence]:
-        """What discovery looks at of each of the states (``StateGaussians``): surface points and rendered depth."""
-        found, options = self.config("discovery"), {"backend": self.rasterizer, "device": self.device}
-        train = [self.scene.select(state=s.state, split="train") for s in states]
-        size = (found.evidence_size, found.min_opacity)
-        return [gather_evidence(s.gaussians, v, *size, **options) for s, v in zip(states, train, strict=True)]
 
 
 def levels_of(config: Any) -> set[int]:

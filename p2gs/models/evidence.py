@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from p2gs.models.context import RunContext
 from p2gs.models.discovery import StateEvidence
 from p2gs.models.draw import render_gaussians
 from p2gs.types import Camera, GaussianTensors, View
@@ -63,3 +64,11 @@ def gather_evidence(
         alphas=alphas,
         cameras=cameras,
     )
+
+
+def evidence_of(run: RunContext, states) -> list[StateEvidence]:
+    """What discovery looks at of each of the states (``StateGaussians``), with discovery's options."""
+    found, options = run.config("discovery"), {"backend": run.rasterizer, "device": run.device}
+    train = [run.scene.select(state=s.state, split="train") for s in states]
+    size = (found.evidence_size, found.min_opacity)
+    return [gather_evidence(s.gaussians, v, *size, **options) for s, v in zip(states, train, strict=True)]

@@ -19,6 +19,7 @@ from p2gs.data.views import TargetImage, TrainingViews
 from p2gs.models.context import RunContext
 from p2gs.models.discovery.evidence import DepthStack, StateEvidence
 from p2gs.models.discovery.surfels import build_surfels
+from p2gs.models.evidence import evidence_of
 from p2gs.models.handover import Registration, StateGaussians
 from p2gs.models.photo_fit import COLOUR, STRUCTURE, PhotoSide, compare, fit_photographs, photograph, unmoved
 from p2gs.models.registered import REGISTRATION, dimmed, register_state, register_views, write_registration
@@ -158,7 +159,7 @@ class RegistrationStage(Stage):
     @classmethod
     def compute(cls, run: RunContext, section, *, states: list[StateGaussians]) -> Registration:
         say = partial(run.log, cls.phase_name)
-        return align_states(states, run.evidence(states), run.views, run.scene.box, section.config, run.rasterizer, say)
+        return align_states(states, evidence_of(run, states), run.views, run.scene.box, section.config, run.rasterizer, say)
 
     @classmethod
     def hand_on(cls, run: RunContext, value: Registration, *, states: list[StateGaussians]) -> dict:

@@ -20,6 +20,7 @@ from typing import Iterable, Optional
 
 COMMENTS = re.compile(rb"//[^\n]*|/\*.*?\*/", re.S)  # of C++; a string that looks like one changes nothing but the fingerprint's grain
 NATIVE = "p2gs.native"
+MOST_KEPT = 2000  # sources in the cache
 
 
 @dataclass(frozen=True)
@@ -30,49 +31,63 @@ class Source:
     imports: tuple[str, ...]
 
 
-def code_of(modules: Iterable[str]) -> dict[str, str]:
-    """Module -> hash for the given modules and all modules of the same top-level packages that they import, directly or not.
+class CodeReader:
+    """Reads each source file once; what has been read before by any run comes from the user's cache folder, where there is one."""
 
-    A plugin's module counts with those that lie beside it. A parent package's ``__init__`` counts only where it is imported itself.
-    Modules without source (built interactively) are left out.
-    """
-    found: dict[str, str] = {}
-    todo = list(modules)
-    with _cache() as sources:
+    def __init__(self) -> None:
+        self.sources: dict[str, Optional[Source]] = {}  # by module
+        self.cache = TreeCache()
+
+    def code_of(self, modules: Iterable[str]) -> dict[str, str]:
+        """Module -> hash for the given modules and all modules of the same top-level packages that they import, directly or not.
+
+        A plugin's module counts with those that lie beside it. A parent package's ``__init__`` counts only where it is imported itself.
+        Modules without source (built interactively) are left out.
+        """
+        found: dict[str, str] = {}
+        todo = list(modules)
         while todo:
             name = todo.pop()
-            path = None if name in found else module_file(name)
-            if path is None:
-                continue
-            source = sources.of(path)
-            found[name] = source.tree
-            roots = {name.split(".")[0], "p2gs"}
-            for target in source.imports:
-                todo += [t for t in (target, target.rpartition(".")[0]) if t and (t.split(".")[0] in roots or _beside(t, path))]
-    if NATIVE in found:
-        found["native kernels"] = native_code()
-    return found
+            source = None if name in found else self.source(name)
+            if source is not None:
+                found[name] = source.tree
+                todo += source.imports
+        self.cache.save()
+        if NATIVE in found:
+            found["native kernels"] = native_code()
+        return found
+
+    def source(self, name: str) -> Optional[Source]:
+        """Of a module, its imports narrowed to modules of the same package, of p2gs, or beside it; None where it has no source."""
+        if name not in self.sources:
+            path = module_file(name)
+            source = None if path is None else self.cache.of(path)
+            if source is not None:
+                roots = {name.split(".")[0], "p2gs"}
+                names = {t for target in source.imports for t in (target, target.rpartition(".")[0]) if t}
+                near = tuple(sorted(t for t in names if t.split(".")[0] in roots or _beside(t, path)))
+                source = Source(source.tree, near)
+            self.sources[name] = source
+        return self.sources[name]
 
 
 def module_file(name: str) -> Optional[Path]:
-    """The source file of a module; None for what is no module, or has none."""
-    module = sys.modules.get(name)
-    origin = getattr(module, "__file__", None)
-    if module is None:
-        parent = name.rpartition(".")[0]
-        if parent and module_file(parent) is None:
+    """The source file of a module, found without importing it; None for what is no module, or has none."""
+    if name in sys.modules:
+        origin = getattr(sys.modules[name], "__file__", None)
+        return Path(origin) if origin and origin.endswith(".py") else None
+    parent, _, last = name.rpartition(".")
+    if not parent:
+        try:
+            spec = importlib.util.find_spec(name)
+        except (ImportError, ValueError):
             return None
-        origin = _origin(name)
-    return Path(origin) if origin and origin.endswith(".py") else None
-
-
-@functools.cache
-def _origin(name: str) -> Optional[str]:
-    try:
-        spec = importlib.util.find_spec(name)
-    except (ImportError, AttributeError, ValueError):  # a.b where a is no package
+        return Path(spec.origin) if spec and spec.origin and spec.origin.endswith(".py") else None
+    package = module_file(parent)
+    if package is None or package.name != "__init__.py":
         return None
-    return spec.origin if spec else None
+    files = (package.parent / f"{last}.py", package.parent / last / "__init__.py")
+    return next((file for file in files if file.is_file()), None)
 
 
 def _beside(name: str, path: Path) -> bool:
@@ -112,46 +127,36 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
 
 
-class _cache:
-    """Fingerprints by the hash of their source, kept between processes in the user's cache folder where there is one to write to."""
+class TreeCache:
+    """Fingerprints by the hash of their source, kept between processes; damaged or unwritable, they are made again."""
 
-    _known: dict[str, Source] = {}  # of this process
-    _read = False
-
-    def __enter__(self) -> "_cache":
-        self.new = False
-        if not _cache._read:
-            _cache._read = True
-            try:
-                stored = json.loads(self.path().read_text())
-                _cache._known |= {k: Source(v[0], tuple(v[1])) for k, v in stored.items()}
-            except (OSError, ValueError, TypeError, IndexError):  # not there, or damaged: made again
-                pass
-        return self
+    def __init__(self) -> None:
+        home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+        self.path, self.new = Path(home) / "p2gs" / "code.json", False
+        try:
+            self.known = {k: Source(v[0], tuple(v[1])) for k, v in json.loads(self.path.read_text()).items()}
+        except (OSError, ValueError, TypeError, IndexError, AttributeError):
+            self.known = {}
 
     def of(self, path: Path) -> Source:
         text = path.read_bytes()
         key = f"{sys.version_info[0]}.{sys.version_info[1]}-{hashlib.sha256(text).hexdigest()[:32]}"
-        if key not in self._known:
+        if key not in self.known:
             try:
-                self._known[key] = read_source(text)
+                self.known[key] = read_source(text)
             except SyntaxError:  # written for another Python, so never imported: as it is
-                self._known[key] = Source(_digest(text), ())
+                self.known[key] = Source(_digest(text), ())
             self.new = True
-        return self._known[key]
+        return self.known[key]
 
-    def __exit__(self, *exc) -> None:
-        if not self.new or exc[0] is not None:
+    def save(self) -> None:
+        if not self.new:
             return
+        self.new = False
         try:
-            self.path().parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile("w", dir=self.path().parent, delete=False) as file:
-                json.dump({k: [s.tree, s.imports] for k, s in list(self._known.items())[-2000:]}, file)
-            os.replace(file.name, self.path())
-        except OSError:  # no home to write to: made again next time
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile("w", dir=self.path.parent, delete=False) as file:
+                json.dump({k: [s.tree, s.imports] for k, s in list(self.known.items())[-MOST_KEPT:]}, file)
+            os.replace(file.name, self.path)
+        except OSError:
             pass
-
-    @staticmethod
-    def path() -> Path:
-        home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-        return Path(home) / "p2gs" / "code.json"

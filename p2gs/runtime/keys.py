@@ -11,7 +11,7 @@ from typing import Any, Iterable
 
 from p2gs.models.context import RunContext
 from p2gs.models.stage import Stage
-from p2gs.runtime.code import code_of
+from p2gs.runtime.code import CodeReader
 
 MOST_TOLD = 3  # differences in a sentence
 Parts = dict[str, Any]
@@ -22,6 +22,7 @@ class StageKeys:
 
     def __init__(self, run: RunContext, order: dict[str, type[Stage]]):
         self.run, self.order = run, order
+        self.code = CodeReader()
         self._parts: dict[str, Parts] = {}
 
     def key(self, name: str) -> str:
@@ -43,7 +44,7 @@ class StageKeys:
                 if phase.num_parts_matters:
                     parts[f"num_parts of {stage}"] = phase.num_parts_key(run)
                 modules |= self.modules(stage)
-            parts |= {f"code of {module}": digest for module, digest in code_of(sorted(modules)).items()}
+            parts |= {f"code of {module}": digest for module, digest in self.code.code_of(sorted(modules)).items()}
             self._parts[name] = parts
         return self._parts[name]
 

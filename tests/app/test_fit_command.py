@@ -23,7 +23,7 @@ class Mine(Loss):
 def pipeline(monkeypatch):
     """In place of p2gs.pipeline: notes what it is given."""
     calls = []
-    module = SimpleNamespace(run=lambda cfg, only=None: calls.append((cfg, only)) or cfg.run_dir)
+    module = SimpleNamespace(run=lambda cfg, only=None, keep_stale=False: calls.append((cfg, only)) or cfg.run_dir)
     monkeypatch.setitem(sys.modules, "p2gs.pipeline", module)
     monkeypatch.setattr(sys.modules["p2gs"], "pipeline", module, raising=False)
     return calls

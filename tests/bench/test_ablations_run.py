@@ -56,7 +56,7 @@ def states_and_motions(parts: int = 2) -> tuple[list[StateGaussians], PartMotion
 
 
 def run_two_steps(preset: str, name: str, scene: str, run: Path, *words: str) -> tuple[Pipeline, ArticulationPhase, handover.Articulation]:
-    """Fusion and articulation of a config, two steps each where it takes steps at all, from reconstructions and motions that are given."""
+    """Pipeline, trained phase, and what it handed over: fusion and articulation of a config, two steps each where it takes steps at all, from reconstructions and motions that are given."""
     words = ["--data.root", scene, "--run", str(run), *TINY, *words]
     plain = load_config([f"preset/{preset}.yaml", f"ablation/{name}.yaml"], words)
     words += ["--num_parts", "3"] if plain.num_parts == "auto" else []
@@ -64,12 +64,21 @@ def run_two_steps(preset: str, name: str, scene: str, run: Path, *words: str) ->
         words += [f"--phases.{phase}.steps", str(min(plain.phases[phase].config.steps, 2))]
     pipe = Pipeline(load_config([f"preset/{preset}.yaml", f"ablation/{name}.yaml"], words))
     states, motions = states_and_motions()
-    motions = motions if pipe.init == "discovery" else None
-    if pipe.exact:
+    motions = motions if pipe.context.init == "discovery" else None
+    if pipe.context.exact:
         motions, _ = merge_to(motions, states, pipe.cfg.num_parts)
-    canonical = pipe.train("canonical_fusion", lambda section: pipe.fusion(states, states, motions, section))
+    given = {"states": states, "motions": motions}
+    given["canonical"] = pipe.make("canonical_fusion", given)
     made = []
-    learned = pipe.train("articulation", lambda section: made.append(pipe.articulate(canonical, states, motions, section)) or made[0])
+
+    class Seen(ArticulationPhase):
+        @classmethod
+        def build(cls, *args, **options):
+            made.append(ArticulationPhase.build(*args, **options))
+            return made[0]
+
+    pipe.order["articulation"] = Seen
+    learned = pipe.make("articulation", given)
     return pipe, made[0], learned
 
 
@@ -118,7 +127,7 @@ def test_the_parts_that_are_merged_are_those_of_the_cheapest_joint():
 
 
 def test_losses_that_would_vanish_are_named(scene, tmp_path):
-    with pytest.raises(UserError, match="art, velocity, vector need observed pairs"):
+    with pytest.raises(UserError, match="art, vector, velocity need observed pairs"):
         run_two_steps("cpu", "no_canonical", scene, tmp_path, "--phases.articulation.pair_target", "matched")
 
 

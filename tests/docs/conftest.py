@@ -16,13 +16,14 @@ def desk(tmp_path, monkeypatch):
     from p2gs.config import import_builtins
     from p2gs.data.base import DATASETS
     from p2gs.losses.base import LOSSES
+    from p2gs.models.stage import PHASES
     from p2gs.native import native
     from p2gs.render import RASTERIZERS, find_rasterizer
 
     import_builtins()
     for name in ("torch_ref", "cpu") if native is not None else ("torch_ref",):
         find_rasterizer(name)  # registers when first imported: before the registries are copied
-    for registry in (LOSSES, CALLBACKS, DATASETS, RASTERIZERS):
+    for registry in (LOSSES, CALLBACKS, PHASES, DATASETS, RASTERIZERS):
         monkeypatch.setattr(registry, "_items", dict(registry.items()))
     monkeypatch.delenv("P2GS_PLUGINS", raising=False)
     monkeypatch.chdir(tmp_path)
