@@ -21,7 +21,8 @@ import yaml
 
 from p2gs.config import load_config
 from p2gs.data.ground_truth import load_ground_truth
-from p2gs.metrics.joints import evaluate_joints, joint_errors
+from p2gs.metrics.joints import joint_errors
+from p2gs.metrics.modules import JointError
 from p2gs.models import handover
 from p2gs.models.part_motions import find_part_motions
 from p2gs.ops import se3
@@ -43,7 +44,7 @@ def to_training(T: torch.Tensor, similarity) -> torch.Tensor:
 
 
 def joint_of(T: torch.Tensor, kind: str) -> SimpleNamespace:
-    """A transform [4, 4] as the joint that ``evaluate_joints`` reads."""
+    """A transform [4, 4] as the joint that the metrics read."""
     if kind == "prismatic":
         length = T[:3, 3].norm()
         return SimpleNamespace(type=kind, axis=T[:3, 3] / length.clamp_min(1e-9), origin=torch.zeros(3).double(), motion=float(length))
@@ -90,7 +91,9 @@ class Case:
     def score(self, transforms: torch.Tensor, types: list[str]) -> dict:
         """Each true joint's errors and whether it is right; how many parts are too many."""
         found = [joint_of(to_input(T.double(), self.similarity), kind) for T, kind in zip(transforms, types, strict=True)]
-        report = evaluate_joints(found, self.truth.joints)
+        metric = JointError()
+        metric.update(found, self.truth.joints)
+        report = metric.report
         rows = []
         for s in report.joints:
             others = self.ties.get(self.joints[s.gt], []) if self.joints else []

@@ -65,11 +65,12 @@ def current_joints(phase, similarity: Similarity, prismatic_below: float) -> Opt
 
 def joint_scores(joints: list[Joint], truth) -> dict[str, float]:
     """Errors by joint (``1/axis_angle`` ...) and the number that failed, as a logger takes them."""
-    from p2gs.metrics.joints import evaluate_joints
+    from p2gs.metrics.modules import JointError
 
-    report = evaluate_joints(joints, list(truth))
-    values = {"failures": float(report.failures)}
-    for score in report.joints:
+    metric = JointError()
+    metric.update(joints, list(truth))
+    values = {"failures": float(metric.compute()["failures"])}
+    for score in metric.report.joints:
         if score.errors is not None:
             errors = {"axis_angle": score.errors.axis_angle, "axis_position": score.errors.axis_position, "motion": score.errors.motion}
             values.update({f"{score.gt + 1}/{k}": v for k, v in errors.items() if v is not None})

@@ -33,13 +33,11 @@ from p2gs.export.pose import pose
 from p2gs.export.protocol import surface_options
 from p2gs.export.twin_json import load_twin
 from p2gs.export.views import bounds
-from p2gs.metrics.joints import evaluate_joints
-from p2gs.metrics.lpips import lpips, why_absent
 from p2gs.metrics.lpips import wanted as lpips_wanted
-from p2gs.metrics.penetration import evaluate_penetration
+from p2gs.metrics.lpips import why_absent
+from p2gs.metrics.modules import JointError, PartChamfer, Penetration, ViewQuality
 from p2gs.models.registered import as_fitted
-from p2gs.ops.ssim import psnr, ssim
-from p2gs.types import ArticulatedObject, TwoStateScene, UserError, View
+from p2gs.types import ArticulatedObject, TwoStateScene, UserError
 
 if TYPE_CHECKING:
     from p2gs.data.ground_truth import GroundTruth
@@ -64,13 +62,16 @@ def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict
     if truth is None:
         missing.append("the scene has no ground-truth joints or meshes")
     else:
-        report = evaluate_joints([p.joint for p in obj.parts if p.joint is not None], truth.joints)
-        metrics["joints"] = report.to_dict()
-        chamfer = surface_scores(run_dir, truth, {s.gt: s.pred for s in report.joints if s.pred is not None}, missing)
+        joints = JointError()
+        joints.update([p.joint for p in obj.parts if p.joint is not None], truth.joints)
+        metrics["joints"] = joints.report.to_dict()
+        chamfer = surface_scores(run_dir, truth, joints.report.assignment, missing)
         metrics |= {} if chamfer is None else {"chamfer": chamfer}
     with rasterizer_of(run_dir):
         metrics["views"] = view_scores(obj, scene, missing)
-    metrics["penetration"] = evaluate_penetration(obj)
+    inside = Penetration()
+    inside.update(obj)
+    metrics["penetration"] = inside.means()
     if (run_dir / "slots.json").is_file():
         metrics["slots"] = json.loads((run_dir / "slots.json").read_text())
     metrics["seconds"] = round(time.perf_counter() - began, 2)
@@ -122,9 +123,10 @@ def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]
         if not views:
             missing.append(f"the {name} state has no photographs")
             continue
-        gaussians = pose(obj, float(state))
-        rows = [one_view(gaussians, view, diagonal) for view in views]
-        out[name] = {"split": split, "count": len(rows)} | _means(rows)
+        gaussians, quality = pose(obj, float(state)), ViewQuality()
+        for view in views:
+            quality.update(draw(gaussians, view.camera, 0.0), view, diagonal)
+        out[name] = {"split": split, "count": len(views)} | quality.means()
     if out and lpips_wanted() and why_absent() is not None:
         missing.append(why_absent())
     if out and not any("depth_median" in s for s in out.values()):
@@ -135,34 +137,9 @@ def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]
     return out
 
 
-def one_view(gaussians, view: View, diagonal: float) -> dict[str, float]:
-    """Scores of one photograph; the render is composited over white and over black exactly as the photograph is."""
-    out = draw(gaussians, view.camera, 0.0)
-    mask = view.alpha.float() / 255
-    photo = view.image.float() / 255 * mask[..., None]
-    black = out.colour.clamp(0, 1)
-    white, photo_white = (out.colour + (1 - out.alpha)[..., None]).clamp(0, 1), photo + (1 - mask)[..., None]
-    row = {"psnr_white": float(psnr(white, photo_white)), "psnr_black": float(psnr(black, photo))}
-    row |= {"ssim_white": float(ssim(white, photo_white)), "ssim_black": float(ssim(black, photo))}
-    perceived = lpips(white, photo_white)
-    if perceived is not None:
-        row["lpips"] = perceived
-    inside = mask > 0.5
-    if inside.any():
-        row["psnr_masked"] = float(psnr(white[inside], photo_white[inside]))
-    row["alpha_error"] = float((out.alpha - mask).abs().mean())
-    if view.depth is not None:
-        known = inside & (view.depth > 0)
-        if known.any():
-            off = (out.expected_depth - view.depth)[known].abs().numpy()
-            row["depth_median"], row["depth_p90"] = (float(np.quantile(off, q)) for q in (0.5, 0.9))
-            row["depth_bad"] = float((off > 0.01 * diagonal).mean())
-    return row
-
-
 def surface_scores(run_dir: Path, truth: "GroundTruth", assignment: dict[int, int], missing: list[str]) -> Optional[dict]:
     """Chamfer distances of RUN/meshes against the ground truth's; None where either is missing."""
-    from p2gs.metrics.chamfer import PartMeshes, evaluate_chamfer
+    from p2gs.metrics.chamfer import PartMeshes, read_part_meshes
 
     pred, gt = {}, {}
     for state, name in enumerate(STATES):
@@ -175,15 +152,10 @@ def surface_scores(run_dir: Path, truth: "GroundTruth", assignment: dict[int, in
             return None
         whole_apart = surface_options(run_dir).whole == "separate"
         pred[name] = PartMeshes(made[0], made[1:], read_mesh(Path(run_dir) / "meshes" / name / "whole.ply") if whole_apart else None)
-        whole = None if true.whole is None else _load(true.whole)
-        gt[name] = PartMeshes(_load(true.static), [_load(p) for p in true.dynamic], whole)
-    return evaluate_chamfer(pred, gt, assignment).to_dict()
-
-
-def _load(path: Path):
-    import trimesh
-
-    return trimesh.load(path, process=False, force="mesh")
+        gt[name] = read_part_meshes(true.whole, true.static, true.dynamic)
+    chamfer = PartChamfer()
+    chamfer.update(pred, gt, assignment)
+    return chamfer.report.to_dict()
 
 
 def _means(rows: list[dict]) -> dict[str, float]:

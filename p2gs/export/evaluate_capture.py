@@ -17,7 +17,7 @@ from p2gs.data.capture.model import similarity
 from p2gs.data.ground_truth import parse_joint
 from p2gs.export.evaluate import scene_folder
 from p2gs.export.twin_json import load_twin
-from p2gs.metrics.joints import evaluate_joints
+from p2gs.metrics.modules import JointError
 from p2gs.models.registered import REGISTRATION, read_registration
 from p2gs.types import Joint, UserError
 
@@ -99,10 +99,11 @@ def evaluate_capture(run: Path | str, truth: Path | str, root: Optional[Path | s
         for i, e in enumerate(info if isinstance(info, list) else [info])
     ]
     found = [moved_joint(p.joint, T) for p in load_twin(run).parts if p.joint is not None]
-    report = evaluate_joints(found, true)
+    joints = JointError()
+    joints.update(found, true)
     result = {
         "format": "p2gs-capture-metrics/1", "metres_per_unit": float(np.cbrt(np.linalg.det(T[:3, :3]))),
-        "state_misalignment_mm": None if off is None else 1000 * float(off.mean()), "joints": report.to_dict(),
+        "state_misalignment_mm": None if off is None else 1000 * float(off.mean()), "joints": joints.report.to_dict(),
     }  # fmt: skip
     (run / "capture_metrics.json").write_text(json.dumps(result, indent=1) + "\n")
     return result

@@ -1,18 +1,23 @@
 """The metrics as ``torchmetrics.Metric``: collect over objects or batches, reset, log. Thin; the work is in the functions.
 
-States are sums and counts, so results of several processes add up.
+``p2gs test``, the callback ``evaluation`` and the benches compute through these. States are sums and counts, so results of several
+processes add up; ``report`` is what the last update found, joint by joint or view by view.
 """
 
 from __future__ import annotations
+
+import math
+from typing import Any
 
 import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from p2gs.metrics.chamfer import ChamferReport, evaluate_chamfer
+from p2gs.metrics.chamfer import evaluate_chamfer
 from p2gs.metrics.image import evaluate_images
-from p2gs.metrics.joints import JointReport, evaluate_joints
+from p2gs.metrics.joints import evaluate_joints
 from p2gs.metrics.penetration import evaluate_penetration
+from p2gs.metrics.views import DEPTH_NAMES, NAMES, evaluate_view
 
 
 class _Means(Metric):
@@ -25,6 +30,7 @@ class _Means(Metric):
 
     def __init__(self, **options):
         super().__init__(**options)
+        self.report: Any = None
         for name in self.names:
             self.add_state(f"{name}_sum", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
             self.add_state(f"{name}_count", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
@@ -33,7 +39,7 @@ class _Means(Metric):
 
     def _note(self, values: dict) -> None:
         for name in self.names:
-            if values[name] is not None:
+            if values.get(name) is not None:
                 setattr(self, f"{name}_sum", getattr(self, f"{name}_sum") + float(values[name]))
                 setattr(self, f"{name}_count", getattr(self, f"{name}_count") + 1)
         for name in self.counted:
@@ -42,6 +48,14 @@ class _Means(Metric):
     def compute(self) -> dict[str, Tensor]:
         means = {n: getattr(self, f"{n}_sum") / getattr(self, f"{n}_count") for n in self.names}
         return means | {n: getattr(self, n) for n in self.counted}
+
+    def means(self) -> dict[str, float]:
+        """``compute()`` as plain numbers, for JSON, without the names for which nothing came."""
+        return {name: value.item() for name, value in self.compute().items() if not math.isnan(value.item())}
+
+    def reset(self) -> None:
+        super().reset()
+        self.report = None
 
 
 class JointError(_Means):
@@ -60,7 +74,7 @@ class JointError(_Means):
 
     def update(self, pred, gt, assignment=None) -> None:
         """pred, gt: lists of joints of one object, see ``evaluate_joints``."""
-        report: JointReport = evaluate_joints(pred, gt, assignment)
+        self.report = report = evaluate_joints(pred, gt, assignment)
         values = {"axis_angle": report.axis_angle_mean, "pos_artgs": report.pos_mean_artgs, "pos_revolute": report.pos_mean_revolute}
         self._note(values | {"motion": report.motion_mean, "failures": report.failures, "joints": len(gt)})
 
@@ -82,7 +96,7 @@ class PartChamfer(_Means):
 
     def update(self, pred, gt, assignment) -> None:
         """State name -> PartMeshes of one object, and gt part -> predicted part, see ``evaluate_chamfer``."""
-        report: ChamferReport = evaluate_chamfer(pred, gt, assignment)
+        self.report = report = evaluate_chamfer(pred, gt, assignment)
         self._note({"static": report.static, "movable": report.movable, "whole": report.whole, "failures": report.failures})
 
 
@@ -100,8 +114,23 @@ class ImageQuality(_Means):
 
     def update(self, pred, target) -> None:
         """Lists of images [H, W, 3] in [0, 1], see ``evaluate_images``."""
-        for view in evaluate_images(pred, target).per_view:
+        self.report = evaluate_images(pred, target)
+        for view in self.report.per_view:
             self._note(view)
+
+
+class ViewQuality(_Means):
+    """Means over views of ``evaluate_view``: psnr_*, ssim_*, lpips, alpha_error, depth_*.
+
+    ``metric = ViewQuality(); metric.update(render, view, diagonal); metric.means()["psnr_white"]``
+    """
+
+    names = (*NAMES, *DEPTH_NAMES)
+
+    def update(self, render, view, diagonal: float) -> None:
+        """render: RenderOutput over black.  view: the photograph.  diagonal: of the object's box."""
+        self.report = evaluate_view(render, view, diagonal)
+        self._note(self.report)
 
 
 class Penetration(_Means):
@@ -114,4 +143,5 @@ class Penetration(_Means):
 
     def update(self, twin) -> None:
         """twin: p2gs.types.ArticulatedObject."""
-        self._note(evaluate_penetration(twin))
+        self.report = evaluate_penetration(twin)
+        self._note(self.report)

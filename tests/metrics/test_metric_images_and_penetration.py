@@ -109,3 +109,44 @@ def test_metrics_leave_out_what_is_missing():
     assert result["joints"] == 3
     assert result["pos_revolute"] == pytest.approx(0, abs=1e-9)
     assert metric.pos_revolute_count == 1
+
+
+def test_view_scores_and_their_metric():
+    """A render that is the photograph but for one known error in each quantity."""
+    from p2gs.metrics.views import evaluate_view
+    from p2gs.types import Camera, RenderOutput, View
+
+    size, g = 40, torch.Generator().manual_seed(3)
+    colour = (torch.rand(size, size, 3, generator=g) * 255).byte()
+    alpha = torch.zeros(size, size, dtype=torch.uint8)
+    alpha[8:32, 8:32] = 255
+    depth = torch.where(alpha > 0, 2.0, 0.0)
+    view = View("v", 0, "test", Camera(torch.eye(4), torch.eye(3), size, size), colour, alpha, depth)
+    mask = (alpha > 0).float()
+    photo = colour.float() / 255 * mask[..., None]
+
+    def render(shift=0.0, deeper=0.0):
+        return RenderOutput((photo + shift * mask[..., None]), mask, (depth + deeper) * mask, None, 0.0, None, None, torch.zeros(1), None)
+
+    exact = evaluate_view(render(), view, diagonal=3.0)
+    assert exact["psnr_white"] == exact["psnr_black"] == float("inf") and exact["alpha_error"] == 0 and exact["depth_bad"] == 0
+    assert exact["ssim_white"] == pytest.approx(1, abs=1e-6)
+    off = evaluate_view(render(deeper=0.05), view, diagonal=3.0)
+    assert off["depth_median"] == pytest.approx(0.05, abs=1e-5) and off["depth_bad"] == 1
+    assert evaluate_view(render(deeper=0.02), view, diagonal=3.0)["depth_bad"] == 0
+    darker = evaluate_view(render(shift=-0.01), view, diagonal=3.0)
+    covered = float(mask.mean())
+    wrong = photo - (photo - 0.01).clamp(0) * mask[..., None]
+    expected = -10 * torch.log10(wrong.square().mean()).item()
+    assert darker["psnr_black"] == pytest.approx(expected, abs=1e-3)
+    assert darker["psnr_masked"] == pytest.approx(expected + 10 * torch.log10(torch.tensor(covered)).item(), abs=1e-3)
+    metric = modules.ViewQuality()
+    for deeper in (0.01, 0.05):
+        metric.update(render(shift=-0.01, deeper=deeper), view, 3.0)
+    without_depth = View("w", 0, "test", view.camera, colour, alpha)
+    metric.update(render(shift=-0.01), without_depth, 3.0)
+    means = metric.means()
+    assert means["depth_median"] == pytest.approx(0.03, abs=1e-5) and means["psnr_black"] == pytest.approx(darker["psnr_black"])
+    assert "depth_median" not in metric.report and "lpips" not in means and metric.psnr_white_count == 3
+    metric.reset()
+    assert metric.report is None and metric.means() == {}
