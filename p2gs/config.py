@@ -15,9 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Iterable, Literal, Optional, Union
 
+from p2gs.class_path import plain_sections, with_class_paths
 from p2gs.config_files import Layer, overrides_layer, parse_overrides, provenance, read_config, to_yaml
 from p2gs.registry import load_plugins, suggest
 from p2gs.schema import Leaf, Plain, Section, build, check_keys, complete, merge, plain, section_of, switches
+from p2gs.trainer_options import check_trainer_options
 from p2gs.types import UserError, short
 
 if TYPE_CHECKING:
@@ -93,6 +95,8 @@ class RunConfig:
         self.seed, self.run, self.device, self.threads = options.seed, options.run, options.device, options.threads
         self.rasterizer, self.num_parts, self.plugins = options.rasterizer, options.num_parts, options.plugins
         self.exact_parts, self.strict_paths, self.stages = options.exact_parts, options.strict_paths, options.stages
+        self.trainer: Plain = values["trainer"] or {}
+        check_trainer_options(self.trainer)
         self.data_options: Plain = values["data"]
         self._data: Optional[LightningDataModule] = None
         self.phases: dict[str, PhaseSection] = {}
@@ -158,7 +162,15 @@ class RunConfig:
 
     def to_dict(self) -> Plain:
         """The whole merged config, defaults included, as plain values: ``load_config`` reads it back."""
-        return plain(self._values)
+        from p2gs.callbacks.base import CALLBACKS
+        from p2gs.losses.base import LOSSES
+
+        out = plain(self._values)
+        for place in (out, *filter(None, out["phases"].values())):
+            for kind, registry in (("losses", LOSSES), ("callbacks", CALLBACKS)):
+                if kind in place:
+                    place[kind] = with_class_paths(place[kind], registry)
+        return out
 
 
 # -- loading -----------------------------------------------------------------------------------------------------------------------
@@ -186,6 +198,7 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
     names = list(dict.fromkeys(map(str, names)))
     load_plugins(tuple(names))
     import_builtins()
+    layers = [Layer(plain_sections(layer.tree, layer.where), layer.where) for layer in layers]
 
     formats, current, root = [], None, None
     for layer in layers:
@@ -252,6 +265,7 @@ def run_schema(data_format: Optional[str]) -> Section:
 
     losses, callbacks = switches(LOSSES.items()), switches(CALLBACKS.items())
     root = section_of(Options)
+    root.children["trainer"] = Leaf(Optional[dict], {})
     root.children["p2gs"] = Leaf(dict, {})  # what save_config notes; read over
     root.children["data"] = section_of(_dataset(data_format)) if data_format else _any_data()
     root.children["data"].children = {"format": Leaf(Optional[str], None), **root.children["data"].children}

@@ -19,6 +19,7 @@ class Registry(Generic[T]):
     def __init__(self, kind: str):
         self.kind = kind
         self._items: dict[str, T] = {}
+        self.paths: dict[str, str] = {}  # name -> class_path of what a config named by it
 
     def register(self, name: str) -> Callable[[T], T]:
         """Decorator. Raises ValueError when the name is taken by something else."""
@@ -31,6 +32,10 @@ class Registry(Generic[T]):
             return item
 
         return wrap
+
+    def put(self, name: str, item: T, path: str) -> None:
+        """Register what a config names by ``class_path``, in place of what it named so before."""
+        self._items[name], self.paths[name] = item, path
 
     def __getitem__(self, name: str) -> T:
         if name not in self._items:

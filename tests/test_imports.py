@@ -19,7 +19,7 @@ ORDER = [
     ("losses", "metrics", "data"),
     ("models",),
     ("export", "callbacks"),
-    ("config",),
+    ("config", "class_path", "trainer_options"),
     ("runtime",),
     ("pipeline", "side_stage", "bench"),
     ("app", "commands"),

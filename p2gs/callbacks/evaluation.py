@@ -44,7 +44,8 @@ class Evaluation(Callback):
         joints = current_joints(phase, self._similarity, self.prismatic_below)
         if joints is not None:
             values = joint_scores(joints, self._truth)
-            trainer.logger.log_metrics({f"{phase.phase_name}/error/{k}": v for k, v in values.items()}, step=phase.step)
+            for logger in trainer.loggers:
+                logger.log_metrics({f"{phase.phase_name}/error/{k}": v for k, v in values.items()}, step=phase.step)
 
 
 def current_joints(phase, similarity: Similarity, prismatic_below: float) -> Optional[list[Joint]]:

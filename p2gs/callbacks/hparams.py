@@ -26,9 +26,10 @@ class Families(Callback):
     changes_result = False
 
     def on_train_start(self, trainer, phase) -> None:
-        add = getattr(getattr(trainer.logger, "experiment", None), "add_custom_scalars", None)
-        if add is not None:
-            add(layout(phase.phase_name, phase.losses))
+        for logger in trainer.loggers:
+            add = getattr(getattr(logger, "experiment", None), "add_custom_scalars", None)
+            if add is not None:
+                add(layout(phase.phase_name, phase.losses))
 
 
 def layout(phase_name: str, losses: dict[str, Any]) -> dict:

@@ -11,7 +11,7 @@ from p2gs.callbacks.base import Callback, due, register_callback
 
 @register_callback("scalars")
 class Scalars(Callback):
-    """Losses by name, Gaussian count and the phase's summary (joint parameters, part masses) to the logger.
+    """Losses by name, Gaussian count and the phase's summary (joint parameters, part masses) to every logger.
 
     every: steps between two entries. Goes to ``logger.log_metrics`` directly: ``LightningModule.log`` costs 0.2-0.35 ms a key and
     step whatever its interval, a quarter of a training step with a dozen losses.
@@ -26,7 +26,8 @@ class Scalars(Callback):
         values = {name: float(value) for name, value in phase.scalars.items()}
         values["gaussians"] = float(phase.num_gaussians)
         values.update(phase.summary())
-        trainer.logger.log_metrics({f"{phase.phase_name}/{k}": v for k, v in values.items()}, step=phase.step)
+        for logger in trainer.loggers:
+            logger.log_metrics({f"{phase.phase_name}/{k}": v for k, v in values.items()}, step=phase.step)
 
 
 def add_image(logger, name: str, image: Tensor, step: int) -> bool:
@@ -50,5 +51,5 @@ class Images(Callback):
         if trainer.logger is None or not due(phase.step, self.every, phase.total_steps):
             return
         for name, image in phase.preview(self.times).items():
-            if not add_image(trainer.logger, name, image, phase.step):
+            if not any([add_image(logger, name, image, phase.step) for logger in trainer.loggers]):
                 return

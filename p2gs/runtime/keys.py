@@ -12,6 +12,7 @@ from typing import Any, Iterable
 from p2gs.models.context import RunContext
 from p2gs.models.stage import Stage
 from p2gs.runtime.code import CodeReader
+from p2gs.trainer_options import callback_modules, decides_result
 
 MOST_TOLD = 3  # differences in a sentence
 Parts = dict[str, Any]
@@ -36,6 +37,8 @@ class StageKeys:
             parts = {option: cfg.section(option) for option in ("seed", "rasterizer")} | {"device": run.device.type}
             parts |= flat("data", cfg.section("data")) | {f"file {file}": digest for file, digest in self.files.items()}
             modules = {type(cfg.data).__module__, rasterizer_module(run.rasterizer)}
+            modules |= callback_modules(cfg.trainer)
+            parts |= flat("trainer", decides_result(cfg.trainer)) if decides_result(cfg.trainer) else {}
             for stage in list(self.order)[: list(self.order).index(name) + 1]:
                 phase = self.order[stage]
                 if not phase.wanted(run):

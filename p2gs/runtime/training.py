@@ -7,7 +7,6 @@ from typing import Any, Optional
 
 import torch
 from lightning.pytorch import Trainer, seed_everything
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 
 from p2gs.models.context import RunContext
@@ -15,6 +14,7 @@ from p2gs.models.phase import Phase
 from p2gs.models.sealed import check_seal
 from p2gs.models.stage import Stage
 from p2gs.stopping import at_step_ends
+from p2gs.trainer_options import trainer_arguments
 
 
 def train(run: RunContext, cls: type[Stage], stage: str, section: Any, key: str, given: dict) -> Any:
@@ -29,19 +29,14 @@ def train(run: RunContext, cls: type[Stage], stage: str, section: Any, key: str,
     order = sorted(callbacks, key=lambda n: (not callbacks[n].changes_result, n == "checkpoint"))
     if phase.total_steps <= 0:
         return phase.hand_over()
+    arguments = trainer_arguments(run.cfg.trainer, run.run_dir, stage)
+    arguments["callbacks"] = [*(callbacks[n] for n in order), *arguments["callbacks"]]
     trainer = Trainer(
         max_steps=phase.total_steps,
-        max_epochs=-1,
         accelerator="gpu" if run.device.type == "cuda" else "cpu",
-        devices=1,
-        logger=TensorBoardLogger(run.run_dir / "logs", name=stage, version="", default_hp_metric=False),
-        callbacks=[callbacks[n] for n in order],
         default_root_dir=run.run_dir,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        enable_checkpointing=False,
-        num_sanity_val_steps=0,
         plugins=[LightningEnvironment()],  # on SLURM, too: a run is one process, and resumes from its own checkpoints alone
+        **arguments,
     )
     with at_step_ends():
         trainer.fit(phase, ckpt_path=resumable(run.run_dir, stage, key), weights_only=True)

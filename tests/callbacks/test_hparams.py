@@ -55,10 +55,10 @@ def test_the_layout_reaches_the_logger_and_a_logger_without_one_is_left_alone():
             self.__dict__.update(values)
 
     phase, writer = Named(phase_name="single_state_1", losses={"render": LOSSES["render"]()}), Writer()
-    Families().on_train_start(Named(logger=Named(experiment=writer)), phase)
+    Families().on_train_start(Named(loggers=[Named(experiment=writer)]), phase)
     assert list(writer.tree) == ["single_state_1: losses"]
-    Families().on_train_start(Named(logger=None), phase)
-    Families().on_train_start(Named(logger=Named(experiment=object())), phase)
+    Families().on_train_start(Named(loggers=[]), phase)
+    Families().on_train_start(Named(loggers=[Named(experiment=object())]), phase)
 
 
 def test_parameters_and_scores_are_read_back_from_the_event_file(tmp_path):

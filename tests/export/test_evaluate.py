@@ -18,6 +18,7 @@ from p2gs.export.paint import draw
 from p2gs.export.pose import pose
 from p2gs.export.run_folder import write_twin
 from p2gs.export.score_table import score_tables
+from p2gs.metrics.views import evaluate_view
 from p2gs.types import TwoStateScene, UserError
 
 
@@ -81,7 +82,7 @@ def test_a_twin_with_a_wrong_joint_scores_worse_where_it_should(run):
 def test_white_and_black_scores_are_those_of_composited_images(scene):
     """Against a slow twin: composite the twin's render and the photograph by hand over each background."""
     twin, view = toy_twin(), scene.select(1, "test")[0]
-    row = evaluate.one_view(pose(twin, 0.9), view, 1.0)
+    row = evaluate_view(draw(pose(twin, 0.9), view.camera, 0.0), view, 1.0)
     for name, background in (("white", 1.0), ("black", 0.0)):
         render = draw(pose(twin, 0.9), view.camera, background).colour.clamp(0, 1).numpy()
         alpha = view.alpha.numpy()[..., None] / 255
@@ -146,4 +147,4 @@ def test_a_run_without_config_is_told(tmp_path):
 def test_an_unknown_depth_is_not_scored(scene):
     view = scene.select(0, "test")[0]
     none = replace(view, depth=torch.zeros_like(view.depth))
-    assert "depth_median" not in evaluate.one_view(pose(toy_twin(), 0.0), none, 1.0)
+    assert "depth_median" not in evaluate_view(draw(pose(toy_twin(), 0.0), none.camera, 0.0), none, 1.0)
