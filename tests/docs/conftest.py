@@ -25,6 +25,7 @@ def desk(tmp_path, monkeypatch):
         find_rasterizer(name)  # registers when first imported: before the registries are copied
     for registry in (LOSSES, CALLBACKS, PHASES, DATASETS, RASTERIZERS):
         monkeypatch.setattr(registry, "_items", dict(registry.items()))
+        monkeypatch.setattr(registry, "paths", {})
     monkeypatch.delenv("P2GS_PLUGINS", raising=False)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
