@@ -1,7 +1,9 @@
-"""Classes by ``class_path`` and ``init_args``, as Lightning's own configs have them: loggers, callbacks, data and losses of the user's.
+"""Classes by ``class_path`` and ``init_args``, as Lightning's own configs have them: loggers, callbacks, data and
+losses of the user's.
 
-``losses: {mine: {class_path: my_losses.Mine, init_args: {weight: 0.1}}}`` is ``losses: {mine: {weight: 0.1}}`` of a class registered as
-``mine``; ``data: {class_path: my_data.Mine, init_args: {...}}`` is ``data: {format: my_data.Mine, ...}``.
+``losses: {mine: {class_path: my_losses.Mine, init_args: {weight: 0.1}}}`` is ``losses: {mine: {weight: 0.1}}`` of a
+class registered as ``mine``; ``data: {class_path: my_data.Mine, init_args: {...}}`` is ``data: {format: my_data.Mine,
+...}``.
 """
 
 from __future__ import annotations
@@ -17,15 +19,17 @@ from p2gs.registry import Registry
 from p2gs.types import UserError, short
 
 Plain = dict[str, Any]
+EXPECTED = "class_path: MODULE.CLASS and init_args: {NAME: VALUE}"
 
 
 def given_class(value: Any, where: str) -> Optional[tuple[str, Plain]]:
-    """(class_path, init_args) of a section that names a class, None of any other. Raises UserError where it is malformed."""
+    """(class_path, init_args) of a section that names a class, None of any other. Raises UserError where it is
+    malformed."""
     if not isinstance(value, dict) or "class_path" not in value:
         return None
     path, args = value["class_path"], value.get("init_args") or {}
     if not isinstance(path, str) or not isinstance(args, dict):
-        raise UserError(f"{where}: expected class_path: MODULE.CLASS and init_args: {{NAME: VALUE}}, got {short(value)}")
+        raise UserError(f"{where}: expected {EXPECTED}, got {short(value)}")
     return path, args
 
 
@@ -96,8 +100,8 @@ def with_class_paths(sections: Optional[Plain], registry: Registry) -> Optional[
     """What ``plain_sections`` took apart, put together again for a file that is read back."""
     if sections is None:
         return None
-    paths = registry.paths
-    return {n: {"class_path": paths[n], "init_args": v} if n in paths and v is not None else v for n, v in sections.items()}
+    named = {n: v for n, v in sections.items() if n in registry.paths and v is not None}
+    return sections | {n: {"class_path": registry.paths[n], "init_args": v} for n, v in named.items()}
 
 
 def instance(value: Any, base: type, where: str, **defaults: Any) -> Any:
@@ -112,7 +116,7 @@ def instance(value: Any, base: type, where: str, **defaults: Any) -> Any:
     value = {"class_path": value} if isinstance(value, str) else value
     given = given_class(value, where)
     if given is None or value.keys() - {"class_path", "init_args"}:
-        raise UserError(f"{where}: expected class_path: MODULE.CLASS and init_args: {{NAME: VALUE}}, got {short(value)}")
+        raise UserError(f"{where}: expected {EXPECTED}, got {short(value)}")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     parser = ArgumentParser(exit_on_error=False)

@@ -1,7 +1,7 @@
 """Runs the stages in order, hands over, skips what is done, goes on where a run stopped.
 
-Each stage leaves RUN/checkpoints/<stage>.pt with a key: a hash of all that decides its result (``runtime.keys``). A stage whose file
-has the right key is not run again; a training stage that was interrupted goes on from <stage>.ckpt.
+Each stage leaves RUN/checkpoints/<stage>.pt with a key: a hash of all that decides its result (``runtime.keys``). A
+stage whose file has the right key is not run again; a training stage that was interrupted goes on from <stage>.ckpt.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class Pipeline:
             torch.set_num_threads(cfg.threads)
         self.context = RunContext(cfg, self.device)
         self.order = stage_order(self.context)
-        if "articulation" in self.order and self.context.init != "discovery" and cfg.num_parts == "auto":
-            raise UserError(
-                f"num_parts: auto needs phases.articulation.init: discovery (it is '{self.context.init}'); give --num_parts N"
-            )
+        init = self.context.init
+        if "articulation" in self.order and init != "discovery" and cfg.num_parts == "auto":
+            needs = f"needs phases.articulation.init: discovery (it is '{init}')"
+            raise UserError(f"num_parts: auto {needs}; give --num_parts N")
         self.keys = StageKeys(self.context, self.order)
         self._told: set[str] = set()
 
@@ -68,12 +68,13 @@ class Pipeline:
     def views(self) -> dict[int, TrainingViews]:
         return self.context.views
 
-    # -- results in files -----------------------------------------------------------------------------------------------------
+    # -- results in files ---------------------------------------------------------------------------------------------
     def file(self, stage: str) -> Path:
         return self.run_dir / "checkpoints" / f"{stage}.pt"
 
     def done(self, stage: str) -> Any:
-        """The stage's result, or None when it is not there or something that decides it has changed, which is told once."""
+        """The stage's result, or None when it is not there or something that decides it has changed, which is told
+        once."""
         if not self.file(stage).exists():
             return None
         name = self.phase_of(stage)
@@ -87,7 +88,9 @@ class Pipeline:
             return None
         if header.get("key") == self.keys.key(name):
             return value
-        differ = changes(header.get("made_of") or {}, self.keys.parts(name)) if "made_of" in header else "an earlier version made it"
+        differ = "an earlier version made it"
+        if "made_of" in header:
+            differ = changes(header["made_of"], self.keys.parts(name))
         if stage not in self._told:
             print(f"{stage}: {'kept, though' if self.keep_stale else 'runs again:'} {differ}", flush=True)
             self._told.add(stage)
@@ -105,12 +108,13 @@ class Pipeline:
         (self.run_dir / "checkpoints" / f"{stage}.ckpt").unlink(missing_ok=True)
 
     def note_time(self, stage: str, seconds: float, beside: Optional[str] = None) -> None:
-        """Keep and tell a stage's seconds and peak memory. beside: the stage that ran at the same time, this one in another process."""
+        """Keep and tell a stage's seconds and peak memory. beside: the stage that ran at the same time, this one in
+        another process."""
         peak = resource.getrusage(resource.RUSAGE_CHILDREN if beside else resource.RUSAGE_SELF).ru_maxrss // 1024
         note_stage(self.run_dir, stage, seconds, peak, beside)
         print(f"{stage}: {seconds:.1f} s, peak memory {peak} MiB", flush=True)
 
-    # -- the order ------------------------------------------------------------------------------------------------------------
+    # -- the order ----------------------------------------------------------------------------------------------------
     def run(self, only: Optional[str] = None) -> Path:
         self.run_dir.mkdir(parents=True, exist_ok=True)
         save_config(self.cfg, self.run_dir / "config.yaml")
@@ -133,17 +137,19 @@ class Pipeline:
             return self.stage(name, only, partial(self.make, name, given))
         if not given and phase.trained:
             return self.both_states(name, only)
-        return [self.stage(f"{name}_{s}", only, partial(self.make, f"{name}_{s}", {**given, "state": s})) for s in (0, 1)]
+        stages = {f"{name}_{s}": {**given, "state": s} for s in (0, 1)}
+        return [self.stage(stage, only, partial(self.make, stage, what)) for stage, what in stages.items()]
 
     def stage(self, stage: str, only: Optional[str], make: Callable[[], Any]) -> Any:
         """The result of a stage: from its file, or made and saved now."""
         wanted = only is not None and self.phase_of(stage) == only
         value = None if wanted else self.done(stage)
         if value is not None:
-            print(f"{stage}: done before, unchanged" if stage not in self._told else f"{stage}: done before", flush=True)
+            print(f"{stage}: done before{'' if stage in self._told else ', unchanged'}", flush=True)
             return value
         if only is not None and not wanted:
-            raise UserError(f"--only {only}: the stage '{stage}' before it is not there or its config has changed; run without --only first")
+            why = "is not there, or what makes it has changed"
+            raise UserError(f"--only {only}: the stage '{stage}' before it {why}; run without --only first")
         began = time.perf_counter()
         value = make()
         seconds = time.perf_counter() - began
@@ -160,8 +166,8 @@ class Pipeline:
         return phase.compute(self.context, section, **given)
 
     def both_states(self, name: str, only: Optional[str]) -> list[Any]:
-        """A phase that needs nothing, for both states, at once where there are threads for it. Each has half of the threads then, also when
-        it is the only one left to do: a run that was interrupted ends as it would have.
+        """A phase that needs nothing, for both states, at once where there are threads for it. Each has half of the
+        threads then, also when it is the only one left to do: a run that was interrupted ends as it would have.
         """
         stages, threads = [f"{name}_0", f"{name}_1"], torch.get_num_threads()
         made = [partial(self.make, stage, {"state": s}) for s, stage in enumerate(stages)]
@@ -180,7 +186,8 @@ class Pipeline:
             torch.set_num_threads(threads)
 
     def train_alone(self, stage: str) -> None:
-        """A single state's stage and nothing else, for the process beside a run: the result is kept, the run itself notes its time."""
+        """A single state's stage and nothing else, for the process beside a run: the result is kept, the run itself
+        notes its time."""
         _ = self.scene
         self.keep(stage, self.make(stage, {"state": int(stage[-1])}))
 

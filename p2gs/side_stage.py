@@ -1,8 +1,7 @@
 """One training stage of a run in a process of its own, beside the run.
 
 The two single states need nothing of each other, and two processes of one thread each train them faster than one process of two
-threads trains one after the other.  ``python -m p2gs.side_stage RUN STAGE THREADS`` is that process: it reads RUN/config.yaml, leaves
-RUN/checkpoints/STAGE.pt, and stops, its state saved, when the pipe to its parent closes.
+threads trains one after the other. ``p2gs.side_worker`` is what that process runs.
 """
 
 from __future__ import annotations
@@ -18,11 +17,9 @@ from pathlib import Path
 
 import torch
 
-from p2gs.config import RunConfig, load_config
-from p2gs.machine import is_of_the_machine, machine_says
+from p2gs.config import RunConfig
 from p2gs.models.stage import PHASES
 from p2gs.run_lock import held
-from p2gs.stopping import EXIT_CODE, Terminated, heeding_sigterm
 from p2gs.types import UserError
 
 MISTAKE = "error: "  # what a line starts with that tells a user's mistake
@@ -50,7 +47,7 @@ class SideStage:
         self.last: deque[str] = deque(maxlen=20)
         search = os.pathsep.join(filter(None, sys.path))  # plugins are found there as they are here
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "p2gs.side_stage", str(run_dir), stage, str(threads)],
+            [sys.executable, "-m", "p2gs.side_worker", str(run_dir), stage, str(threads)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -96,43 +93,7 @@ class SideStage:
         return self.seconds
 
 
-def main(run_dir: str, stage: str, threads: str) -> int:
-    from p2gs.callbacks.base import silence_lightning
-    from p2gs.pipeline import Pipeline
-
-    threading.Thread(target=_stop_with_parent, daemon=True).start()
-    silence_lightning()
-    try:
-        cfg = load_config([str(Path(run_dir) / "config.yaml")])
-        cfg.threads = int(threads)
-        with heeding_sigterm():
-            Pipeline(cfg).train_alone(stage)
-    except UserError as err:
-        print(MISTAKE + " ".join(str(err).split()), flush=True)
-        return 2
-    except OSError as err:
-        if not is_of_the_machine(err):
-            raise
-        print(MISTAKE + machine_says(err), flush=True)
-        return 1
-    except Terminated:
-        return EXIT_CODE
-    except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
-        return 130
-    return 0
-
-
 def _reason(code: int) -> str:
     if code == -signal.SIGKILL:
         return " (it was killed, which is what happens when memory runs out)"
     return f" ({signal.Signals(-code).name})" if code < 0 else ""
-
-
-def _stop_with_parent() -> None:
-    """As a scheduler would: the step that is being done is finished, its state saved."""
-    sys.stdin.read()
-    os.kill(os.getpid(), signal.SIGTERM)
-
-
-if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))

@@ -23,17 +23,17 @@ REFUSED = {
     **dict.fromkeys(("max_steps", "max_epochs", "min_steps", "min_epochs", "max_time", "limit_train_batches"), STEPS),
     **dict.fromkeys(("fast_dev_run", "overfit_batches"), f"{STEPS}; -c preset/smoke.yaml takes few everywhere"),
     **dict.fromkeys(("gradient_clip_val", "gradient_clip_algorithm", "accumulate_grad_batches"), OWN_OPTIMISER),
-    **dict.fromkeys(("accelerator", "devices", "strategy", "num_nodes", "sync_batchnorm", "use_distributed_sampler", "plugins"), DEVICE),
+    **dict.fromkeys(
+        ("accelerator", "devices", "strategy", "num_nodes", "sync_batchnorm", "use_distributed_sampler", "plugins"),
+        DEVICE,
+    ),
     "default_root_dir": "the result folder is --run DIR",
     "barebones": "it leaves out the callbacks that keep a run's state",
 }
 FULL_PRECISION = ("32", "32-true", 32, None)
-WATCHING = ("logger", "profiler", "log_every_n_steps", "detect_anomaly", "enable_progress_bar", "enable_model_summary", "enable_checkpointing",
-            "enable_autolog_hparams")  # fmt: skip
-FIXED = {
-    "max_epochs": -1, "devices": 1, "enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False,
-    "num_sanity_val_steps": 0,
-}  # fmt: skip
+SHOWN = ("enable_progress_bar", "enable_model_summary", "enable_checkpointing")
+WATCHING = ("logger", "profiler", "log_every_n_steps", "detect_anomaly", "enable_autolog_hparams", *SHOWN)
+FIXED = {"max_epochs": -1, "devices": 1, "num_sanity_val_steps": 0, **dict.fromkeys(SHOWN, False)}
 
 
 def check_trainer_options(options: dict[str, Any]) -> None:
@@ -46,9 +46,11 @@ def check_trainer_options(options: dict[str, Any]) -> None:
             raise UserError(f"trainer.{name}: cannot be set: {REFUSED[name]}")
         if name not in known:
             close = difflib.get_close_matches(str(name), [n for n in known if n not in REFUSED], n=1)
-            raise UserError(f"trainer: Lightning's Trainer has no '{name}'" + (f" (did you mean '{close[0]}'?)" if close else ""))
+            hint = f" (did you mean '{close[0]}'?)" if close else ""
+            raise UserError(f"trainer: Lightning's Trainer has no '{name}'{hint}")
         if name == "precision" and value not in FULL_PRECISION:
-            raise UserError(f"trainer.precision: Gaussians are trained in float32, which is all that the kernels know, got {short(value)}")
+            only = "Gaussians are trained in float32, which is all that the kernels know"
+            raise UserError(f"trainer.precision: {only}, got {short(value)}")
         if name in ("logger", "callbacks") and not isinstance(value, (bool, list, dict, str, type(None))):
             raise UserError(f"trainer.{name}: expected {{class_path, init_args}} or a list of them, got {short(value)}")
 
@@ -61,8 +63,10 @@ def decides_result(options: dict[str, Any]) -> dict[str, Any]:
 def callback_modules(options: dict[str, Any]) -> set[str]:
     """The modules of ``callbacks`` that are not Lightning's own: their code may decide the result."""
     values = options.get("callbacks") or []
-    paths = [v.get("class_path", "") if isinstance(v, dict) else str(v) for v in (values if isinstance(values, list) else [values])]
-    return {path.rpartition(".")[0] for path in paths if "." in path and not path.startswith(("lightning.", "pytorch_lightning."))}
+    values = values if isinstance(values, list) else [values]
+    paths = [str(v.get("class_path", "") if isinstance(v, dict) else v) for v in values]
+    own = [path for path in paths if not path.startswith(("lightning.", "pytorch_lightning."))]
+    return {path.rpartition(".")[0] for path in own if "." in path}
 
 
 def trainer_arguments(options: dict[str, Any], run_dir: Path, stage: str) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def predict(args: argparse.Namespace) -> int:
     run = finished_run(args.run)
     if args.size is not None and args.size < 16:
         raise UserError(f"--size: expected at least 16 pixels, got {args.size}")
-    from p2gs.export.media import render_states
+    from p2gs.export.states import render_states
 
     for path in render_states(run, args.times, out=args.out, size=args.size, video=args.video):
         print(path)

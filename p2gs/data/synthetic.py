@@ -7,8 +7,7 @@ hemisphere at 3.2 units with a 50 mm lens, test views on a ring at 30 degrees.
 from __future__ import annotations
 
 import zlib
-from pathlib import Path
-from typing import Literal, Optional
+from typing import Optional
 
 import numpy as np
 import torch
@@ -22,7 +21,6 @@ from p2gs.types import Camera, TwoStateScene, View
 RADIUS = 3.2
 FOCAL = 50 / 36  # focal length over image width: 50 mm lens, 36 mm sensor
 TEST_ELEVATION = 30.0
-GENERATOR = 1  # goes up when the same arguments give other pixels
 
 
 def cabinet() -> SyntheticObject:
@@ -93,39 +91,3 @@ def synthetic_scene(obj: SyntheticObject, size: int = 400, train_views: int = 64
         for split, cameras in (("train", train_cameras(train_views, seed + state)), ("test", test_cameras(test_views))):
             views += [render_view(obj, state, split, f"{i:04d}", viewmat, size, shadow) for i, viewmat in enumerate(cameras)]
     return TwoStateScene(obj.name, tuple(views))
-
-
-def synthesize(
-    out_dir,
-    seed: int = 0,
-    kind: Optional[str] = None,
-    size: int = 400,
-    train_views: int = 64,
-    test_views: int = 10,
-    format: Literal["artgs", "dta", "paris"] = "artgs",
-    depth: bool = True,
-) -> Path:
-    """Generate a scene with ground truth and write it; returns its folder. seed: of the object and the cameras.
-
-    kind: see ``make_object``; ``"demo"`` is the demo cabinet.  ``synthetic.json`` in the folder keeps these arguments.
-    Raises UserError for an unknown kind or format, sizes that make no scene, and where ``out_dir`` already holds files.
-    """
-    from p2gs.data.write import write_scene
-
-    arguments = recipe(seed, kind, size, train_views, test_views, format, depth)
-    obj = make_object(kind, seed)
-    return write_scene(obj, out_dir, format, size, train_views, test_views, seed, depth, recipe=arguments)
-
-
-def recipe(seed: int, kind: Optional[str], size: int, train_views: int, test_views: int, format: str = "artgs", depth: bool = True) -> dict:
-    """What ``synthetic.json`` holds: enough to make the same scene again."""
-    return {
-        "generator": GENERATOR,
-        "kind": kind,
-        "seed": seed,
-        "size": size,
-        "train_views": train_views,
-        "test_views": test_views,
-        "format": format,
-        "depth": depth,
-    }

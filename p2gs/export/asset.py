@@ -11,8 +11,9 @@ import numpy as np
 import torch
 
 from p2gs.export.clearance import clear_links
-from p2gs.export.convex import Piece, decompose
+from p2gs.export.convex import decompose
 from p2gs.export.inertia import Inertia, effective_inertia, enclosed, inertia_of, joint_load
+from p2gs.export.links import Hinge, Link
 from p2gs.export.mesh import read_meshes, write_meshes
 from p2gs.export.pose import pose
 from p2gs.export.reach import extend_links
@@ -35,9 +36,6 @@ DENSITIES = {  # kg / m^3 of the collision pieces, which fill a shell's hollow w
 }
 LIKELY_SIZE = (0.05, 3.0)  # m, longest side: a stapler to a wardrobe
 MAX_FACES = 40_000  # a part's visual mesh; simulators refuse meshes of several hundred thousand
-HOLD = 0.02  # friction of a joint, in the weight that hangs on it: holds where the axis leans by a degree, as found axes do
-LIFT = 3.0  # effort limit of a joint in the weight that hangs on it: a hand or a motor that opens it has that much to spare
-QUICK = 0.25  # seconds in which a joint may run through its range: a door that is thrown shut; sets the velocity limit
 SETTLE = 0.5  # seconds in which an undriven joint loses most of its speed; sets the default damping
 UPS = ("z", "y", "x")
 ORIGINS = ("keep", "center", "bottom")
@@ -64,59 +62,6 @@ class Placement:
         quats = quat_multiply(matrix_to_quat(R).expand(len(g), 4), g.quats.double()).float()
         sh = rotate_sh(g.sh, R.to(g.sh)) if g.sh.shape[1] > 1 else g.sh
         return GaussianTensors(means, quats, g.log_scales + math.log(self.scale), g.opacity_logits, sh)
-
-
-@dataclass(frozen=True)
-class Hinge:
-    """A joint in SI units of the target. axis [3] unit, origin [3].  lower, upper, motion: radians or metres, 0 = start state.
-
-    damping: N m s / rad or N s / m.  load: N m or N, of the part's weight where it pulls most.
-    """
-
-    type: str
-    axis: np.ndarray
-    origin: np.ndarray
-    lower: float
-    upper: float
-    motion: float
-    damping: float
-    load: float = 0.0
-
-    @property
-    def friction(self) -> float:
-        """N m or N that holds the joint while it does not move."""
-        return HOLD * self.load
-
-    @property
-    def velocity(self) -> float:
-        """Limit, rad/s or m/s."""
-        return max(self.upper - self.lower, 1e-3) / QUICK
-
-    @property
-    def effort(self) -> float:
-        """Limit, N m or N: lifts the part, and drives it against its damping at the highest speed."""
-        return LIFT * self.load + self.damping * self.velocity
-
-
-@dataclass(frozen=True)
-class Link:
-    """A rigid part at the start state. Geometry is in the link's frame: world axes, origin at the joint's (base: the world's)."""
-
-    name: str
-    part: int
-    visual: Mesh
-    collision: list[Piece]
-    inertia: Inertia
-    joint: Optional[Hinge]
-    colour: tuple[float, float, float]
-    texture: Optional[Texture] = None
-    label: str = ""  # what it is, of ``naming``: door, drawer; empty where names are those of the twin
-    closed: bool = True  # whether the surface encloses a volume
-    splats: Optional[GaussianTensors] = None  # the part's Gaussians, in the link's frame like the rest
-
-    @property
-    def origin(self) -> np.ndarray:
-        return np.zeros(3) if self.joint is None else self.joint.origin
 
 
 @dataclass(frozen=True)
@@ -250,16 +195,3 @@ def open_note(asset: Asset) -> Optional[str]:
     if not names:
         return None
     return f"the mesh of {', '.join(names)} is open where no photograph looked: mass and inertia go by the collision pieces, not by volume"
-
-
-def joint_motion(hinge: Hinge, value: float) -> np.ndarray:
-    """World motion [4, 4] of a link whose joint moved by ``value`` from the start state."""
-    T = np.eye(4)
-    if hinge.type == "prismatic":
-        T[:3, 3] = hinge.axis * value
-        return T
-    x, y, z = hinge.axis
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    T[:3, :3] += np.sin(value) * K + (1 - np.cos(value)) * K @ K
-    T[:3, 3] = hinge.origin - T[:3, :3] @ hinge.origin
-    return T

@@ -7,7 +7,8 @@ from typing import Optional, TextIO
 
 import numpy as np
 
-from p2gs.export.asset import Asset, Link
+from p2gs.export.asset import Asset
+from p2gs.export.links import Link
 from p2gs.export.texture import Texture
 from p2gs.export.tsdf import vertex_normals
 

@@ -8,14 +8,12 @@ reaches into that space is cut back by planes, which leaves it convex. A sweep i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Optional
+from typing import Optional
 
 import numpy as np
 
 from p2gs.export.convex import Piece, cut, separation
-
-if TYPE_CHECKING:
-    from p2gs.export.asset import Hinge, Link
+from p2gs.export.links import Hinge, Link, joint_motion
 
 GAP = 0.003  # share of the object's diagonal that is left between parts: Bullet alone adds 1 mm around each hull
 SHALLOW = 0.02  # share of the diagonal up to which an overlap is an error of the surfaces, which both parts give way to by half
@@ -29,7 +27,7 @@ class Body:
 
     name: str
     pieces: list[Piece]
-    hinge: Optional["Hinge"]
+    hinge: Optional[Hinge]
     before: float  # volume of the pieces when clearing began
 
 
@@ -38,16 +36,14 @@ class Cleared:
     """links: with trimmed pieces.  lost: share of each link's collision volume that went, by name.  blocking: (moving link, other link)
     pairs that run into each other in one of the other's recorded states, though not in both, as photographed: a door before a drawer."""
 
-    links: list["Link"]
+    links: list[Link]
     lost: dict[str, float]
     blocking: list[tuple[str, str]]
 
 
-def clear_links(links: list["Link"]) -> Cleared:
+def clear_links(links: list[Link]) -> Cleared:
     """The links with collision pieces that are free of those of every other link: of the base over each joint's whole range, of each other
     in both recorded states and over the range while the other one is in a recorded state that leaves room (at least one does)."""
-    from p2gs.export.asset import joint_motion
-
     bodies = [body_of(link) for link in links]
     solid = [b for b in bodies if b.pieces]
     if len(solid) < 2:
@@ -82,7 +78,7 @@ def clear_links(links: list["Link"]) -> Cleared:
     return Cleared(out, lost, blocking)
 
 
-def body_of(link: "Link") -> Body:
+def body_of(link: Link) -> Body:
     """The link's pieces in world axes at the start."""
     pieces = [_moved(p, link.origin) for p in link.collision]
     return Body(link.name, pieces, link.joint, sum(p.volume for p in pieces))
@@ -106,8 +102,6 @@ def sweep_values(body: Body, gap: float) -> np.ndarray:
 
 def _poses(body: Body, values: np.ndarray) -> list[tuple[np.ndarray, ...]]:
     """Motions [4, 4] at both ends of each step of the sweep; of the one pose where ``values`` has one."""
-    from p2gs.export.asset import joint_motion
-
     at = [joint_motion(body.hinge, v) for v in values]
     return [(at[0],)] if len(at) == 1 else list(zip(at[:-1], at[1:], strict=True))
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from p2gs.export.asset import Asset, Hinge, Link
+from p2gs.export.asset import Asset
+from p2gs.export.links import Hinge, Link
 from p2gs.export.tsdf import vertex_normals
 from p2gs.ops.palette import part_colour
 

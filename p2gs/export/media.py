@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Optional, Sequence
+from typing import Sequence
 
 import numpy as np
 import torch
 
 from p2gs.export.frame import object_to_input
-from p2gs.export.paint import draw, draw_joints, joint_text, part_coloured, rasterizer_of, to_image
+from p2gs.export.paint import draw, draw_joints, joint_text, part_coloured, to_image
 from p2gs.export.pose import pose
-from p2gs.export.twin_json import load_twin
-from p2gs.export.views import best_camera, orbit, read_cameras
+from p2gs.export.views import best_camera, orbit
 from p2gs.ops.palette import part_colour
 from p2gs.types import ArticulatedObject, Camera, TwoStateScene, UserError
 
@@ -175,32 +174,3 @@ def scene_photos(scene: TwoStateScene, obj: ArticulatedObject):
         return (view.image.float() * a + 255 * (1 - a)).round().to(torch.uint8).numpy(), named[index].camera
 
     return of
-
-
-def render_states(
-    run_dir: Path | str, times: Sequence[float], out: Optional[Path | str] = None, size: Optional[int] = None, video: bool = False
-) -> list[Path]:
-    """Pictures of a finished run at any state times: t<time>.png and parts_t<time>.png in ``out`` (default RUN/media/states).
-
-    Times outside [0, 1] go on along each joint. size: longer side in pixels (default 512). video: also
-    motion.mp4 from start to end and back on a turntable (motion.gif and frames/ where imageio-ffmpeg is not installed).
-
-    Raises UserError when the run has no twin.
-    """
-    run_dir = Path(run_dir)
-    obj = load_twin(run_dir)
-    folder = Path(out) if out is not None else run_dir / "media" / "states"
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    with rasterizer_of(run_dir):
-        base, _ = chosen_camera(obj, [c.camera for c in read_cameras(run_dir / "cameras.json")])
-        camera, _ = framed(obj, base, size or 512)
-        for t in times:
-            for prefix, image in (("", render_plain(obj, camera, t)), ("parts_", render_parts(obj, camera, t))):
-                written.append(folder / f"{prefix}t{t:.3f}.png")
-                save_png(written[-1], image)
-        if video:
-            from p2gs.export.video import turntable_frames, write_video
-
-            written += write_video(folder, list(turntable_frames(obj, size or 512)))
-    return written

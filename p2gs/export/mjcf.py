@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from p2gs.export.asset import Asset, Link
+from p2gs.export.asset import Asset
 from p2gs.export.assets_dir import FOLDER, collision_name, texture_name, visual_name, write_assets
 from p2gs.export.inertia import effective_inertia
+from p2gs.export.links import Link
 from p2gs.export.urdf import number, numbers
 
 GRAVITY = {"z": (0, 0, -9.81), "y": (0, -9.81, 0), "x": (-9.81, 0, 0)}

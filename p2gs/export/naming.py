@@ -11,7 +11,8 @@ from typing import Iterable, Mapping, Optional
 
 import numpy as np
 
-from p2gs.export.asset import Asset, Link, joint_motion
+from p2gs.export.asset import Asset
+from p2gs.export.links import Link, joint_motion
 from p2gs.types import UserError
 
 LABELS = ("drawer", "door", "lid", "flap", "knob", "button", "wheel")  # that geometry tells; a user's may be any

@@ -14,8 +14,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from p2gs.export.asset import Asset, Link
+from p2gs.export.asset import Asset
 from p2gs.export.assets_dir import write_obj
+from p2gs.export.links import Link
 from p2gs.export.urdf import add_inertial, add_joint, fixed_joint, numbers, write_xml
 
 OBJS, PIECES = "textured_objs", "collision_objs"

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from p2gs.export.clearance import GAP, Body, body_of, touches
-
-if TYPE_CHECKING:
-    from p2gs.export.asset import Link
+from p2gs.export.links import Link, joint_motion
 
 FULL_TURN = np.pi  # rad beyond which no hinge is followed
 HELD = 0.1  # share of a slide's length that stays within the base's along the axis, as runners hold a drawer
@@ -18,14 +15,12 @@ STEPS = 32  # of a full turn, or of the base's length: between two of them a pie
 HALVINGS = 6  # of the step in which parts touch
 
 
-def extend_links(links: list["Link"]) -> list["Link"]:
+def extend_links(links: list[Link]) -> list[Link]:
     """The links (cleared of one another, ``links[0]`` the base) with joint limits that go on until pieces touch.
 
     Each end of a joint's range is followed among the other parts as they were in that photographed state; half of the gap that clearing
     left stays. What was observed stays within the limits.
     """
-    from p2gs.export.asset import joint_motion
-
     bodies = [body_of(link) for link in links]
     points = np.concatenate([p.vertices for b in bodies for p in b.pieces])
     margin = 0.5 * GAP * float(np.linalg.norm(np.ptp(points, axis=0)))

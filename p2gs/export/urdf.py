@@ -7,8 +7,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from p2gs.export.asset import Asset, Hinge, Link
+from p2gs.export.asset import Asset
 from p2gs.export.assets_dir import FOLDER, collision_name, visual_name, write_assets
+from p2gs.export.links import Hinge, Link
 
 WORLD = "world"
 

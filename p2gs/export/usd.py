@@ -9,8 +9,9 @@ from typing import Mapping, Optional, Sequence, Union
 
 import numpy as np
 
-from p2gs.export.asset import Asset, Hinge, Link
+from p2gs.export.asset import Asset
 from p2gs.export.assets_dir import texture_name
+from p2gs.export.links import Hinge, Link
 from p2gs.export.splats_usd import splat_prim
 from p2gs.export.tsdf import vertex_normals
 from p2gs.types import UserError

@@ -8,6 +8,8 @@ from typing import Iterator, Sequence
 
 import numpy as np
 
+from p2gs.export.media import render_parts, render_plain, resize, save_png
+from p2gs.export.views import best_camera, orbit
 from p2gs.types import ArticulatedObject
 
 FPS = 24
@@ -18,9 +20,6 @@ def turntable_frames(obj: ArticulatedObject, size: int = 512, seconds: float = 5
 
     The camera starts from the side where most of the moving parts shows and sweeps 60 degrees to either side.
     """
-    from p2gs.export.media import render_parts, render_plain
-    from p2gs.export.views import best_camera, orbit
-
     size -= size % 2
     count, ring = round(seconds * FPS), orbit(obj, 180, size=(size, size))
     front = 6 * best_camera(obj, ring[::6])
@@ -36,8 +35,6 @@ def write_video(folder: Path, frames: Sequence[np.ndarray], fps: int = FPS) -> l
     try:
         import imageio_ffmpeg
     except ImportError:
-        from p2gs.export.media import save_png
-
         stills = folder / "frames"
         stills.mkdir(parents=True, exist_ok=True)
         for i, frame in enumerate(frames):
@@ -56,8 +53,6 @@ def write_video(folder: Path, frames: Sequence[np.ndarray], fps: int = FPS) -> l
 def write_gif(path: Path, frames: Sequence[np.ndarray], fps: int = FPS, width: int = 640) -> Path:
     """An endless GIF of every second frame (Pillow comes with scikit-image)."""
     from PIL import Image
-
-    from p2gs.export.media import resize
 
     h, w = frames[0].shape[:2]
     width = min(width, w)

@@ -17,10 +17,11 @@ DEPTH_NAMES = ("depth_median", "depth_p90", "depth_bad")
 def evaluate_view(render: RenderOutput, view: View, diagonal: float) -> dict[str, float]:
     """Scores by name; what the view has no truth for is left out.
 
-    render: [H, W] pictures over black, on the CPU.  diagonal: of the object's box, in the view's units.  psnr in dB, ssim in [-1, 1], of the
-    render composited over white and over black exactly as the photograph is; psnr_masked over the object's pixels alone; lpips over
-    white, where its weights are at hand; alpha_error mean |alpha - mask|; depth_* of |expected depth - true| on the object: median and
-    90th percentile in the view's units, and the fraction off by more than 1 % of the diagonal.
+    render: [H, W] pictures over black, on the CPU.  diagonal: of the object's box, in the view's units.  psnr in dB,
+    ssim in [-1, 1], of the render composited over white and over black exactly as the photograph is; psnr_masked over
+    the object's pixels alone; lpips over white, where its weights are at hand; alpha_error mean |alpha - mask|; depth_*
+    of |expected depth - true| on the object: median and 90th percentile in the view's units, and the fraction off by
+    more than 1 % of the diagonal.
     """
     mask = view.alpha.float() / 255
     photo = view.image.float() / 255 * mask[..., None]

@@ -24,6 +24,7 @@ from p2gs.ops import se3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors, UserError
 
+
 @dataclass
 class RepelConfig:
     """Repel points (paper section 4.3, appendix). count: N_R.  threshold: how near to the static base a movable part must be,
@@ -101,8 +102,8 @@ class ArticulationPhase(ImagePhase):
     def build(cls, run: RunContext, section, *, states, canonical, sharpened=None, motions=None) -> "ArticulationPhase":
         if motions is None and section.config.init == "discovery":
             raise UserError(
-                "phases.articulation.init: discovery needs 'motions', which no stage hands over; add discovery to stages, or give --num_parts N "
-                "and init: random or identity"
+                "phases.articulation.init: discovery needs 'motions', which no stage hands over; add discovery to stages, "
+                "or give --num_parts N and init: random or identity"
             )
         parts = len(motions) + 1 if motions is not None and not run.exact else run.num_parts
         states = sharpened or states

@@ -15,7 +15,8 @@ from p2gs.types import TwoStateScene, UserError
 class RunContext:
     """One run as its phases see it.
 
-    cfg: the run's ``RunConfig``.  device: what tensors are computed on.  seed, rasterizer, num_parts (int or "auto"): of the config.
+    cfg: the run's ``RunConfig``.  device: what tensors are computed on.  seed, rasterizer, num_parts (int or "auto"):
+    of the config.
     """
 
     def __init__(self, cfg: Any, device: torch.device):
@@ -27,7 +28,7 @@ class RunContext:
         self._views: dict[int, TrainingViews] = {}
         self._scene: TwoStateScene | None = None
 
-    # -- options --------------------------------------------------------------------------------------------------------------
+    # -- options ------------------------------------------------------------------------------------------------------
     def config(self, phase: str) -> Any:
         """Another phase's options; its defaults where the run does not have it."""
         return self.cfg.phase_config(phase)
@@ -59,10 +60,11 @@ class RunContext:
         """A line of progress."""
         print(f"{phase}:", *text, flush=True)
 
-    # -- scene ----------------------------------------------------------------------------------------------------------------
+    # -- scene --------------------------------------------------------------------------------------------------------
     @property
     def scene(self) -> TwoStateScene:
-        """As read, until phases find errors of cameras and exposures, or register the end to the start; corrected from then on."""
+        """As read, until phases find errors of cameras and exposures, or register the end to the start; corrected from
+        then on."""
         return self._scene or self.cfg.data.scene()
 
     @property
@@ -90,7 +92,8 @@ class RunContext:
         if state not in self._views:
             views = self.scene.select(state=state, split="train")
             if not views:
-                raise UserError(f"{self.scene.name}: there are no training views of state {state}; expected photographs of both states")
+                name, both = self.scene.name, "expected photographs of both states"
+                raise UserError(f"{name}: there are no training views of state {state}; {both}")
             sizes = set().union(*(levels_of(self.cfg.phases[name].config) for name in self.cfg.stages))
             self._views[state] = TrainingViews(views, sorted(sizes))
         return self._views[state]

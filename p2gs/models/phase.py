@@ -16,8 +16,8 @@ from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.adam import NamedAdam
 from p2gs.models.health import check_gaussians, check_loss
 from p2gs.models.splats import Splats
-from p2gs.native import serial_torch
 from p2gs.models.stage import PHASES, Stage, register_phase
+from p2gs.native import serial_torch
 from p2gs.render import draws_natively
 from p2gs.stopping import leave_if_asked
 from p2gs.types import UserError
@@ -52,8 +52,9 @@ def exponential(start: float, end: float, fraction: float) -> float:
 class Phase(LightningModule, Stage):
     """One training phase. Owns its Gaussians, rasterizer and whatever else it learns; hands over a small saved object.
 
-    Subclasses give ``build`` (see ``models.stage``), ``parameter_groups`` (name -> (tensors, learning rate)), ``learning_rates(step)`` and ``inputs(step)``; the
-    sum of the losses on those inputs is minimised with one Adam. Which losses are on is the config's business.
+    Subclasses give ``build`` (see ``models.stage``), ``parameter_groups`` (name -> (tensors, learning rate)),
+    ``learning_rates(step)`` and ``inputs(step)``; the sum of the losses on those inputs is minimised with one Adam. Which
+    losses are on is the config's business.
 
     losses: name -> Loss.  scalars: latest detached values by name, for callbacks to log.  seed: makes every random choice a
     pure function of (seed, step), so that a resumed run goes the same way.

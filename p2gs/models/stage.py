@@ -1,7 +1,7 @@
 """How a phase takes part in a run: what it needs of the phases before it, by name, and what it hands over.
 
-The phases of a run are the config's ``stages``, in that order. What each hands over lies under a name, where later phases find it; a
-phase that gives a name anew replaces it for those after it. The names of the built-in phases:
+The phases of a run are the config's ``stages``, in that order. What each hands over lies under a name, where later
+phases find it; a phase that gives a name anew replaces it for those after it. The names of the built-in phases:
 
     states      two ``StateGaussians`` (start, end), registered to the start's frame
     motions     ``PartMotions`` of discovery, None where articulation starts without
@@ -22,9 +22,9 @@ from p2gs.registry import Registry
 class Stage:
     """Base of every phase. One that trains is a ``Phase`` and gives ``build``; one that computes gives ``compute``.
 
-    Config: dataclass of its options.  needs: names that earlier phases must have handed over.  uses: names given as None where no
-    phase hands them over.  gives: name of its own result.  each_state: it runs once for the start and once for the end, and its result
-    is the list of both.  num_parts_matters: whether ``num_parts`` decides its result.
+    Config: dataclass of its options.  needs: names that earlier phases must have handed over.  uses: names given as
+    None where no phase hands them over.  gives: name of its own result.  each_state: it runs once for the start and
+    once for the end, and its result is the list of both.  num_parts_matters: whether ``num_parts`` decides its result.
     """
 
     Config: ClassVar[type]
@@ -37,12 +37,14 @@ class Stage:
 
     @classmethod
     def build(cls, run: RunContext, section: Any, **given: Any) -> Any:
-        """The ``Phase`` to train. section: its ``config`` and ``losses``.  given: what ``needs`` and ``uses`` name (and ``state``, 0 or 1)."""
+        """The ``Phase`` to train. section: its ``config`` and ``losses``.  given: what ``needs`` and ``uses`` name (and
+        ``state``, 0 or 1)."""
         raise NotImplementedError(f"{cls.__name__} trains and has to define build()")
 
     @classmethod
     def compute(cls, run: RunContext, section: Any, **given: Any) -> Any:
-        """The result of a phase that does not train: a dataclass of ``models.handover``, or plain values. Arguments as of ``build``."""
+        """The result of a phase that does not train: a dataclass of ``models.handover``, or plain values. Arguments as
+        of ``build``."""
         raise NotImplementedError(f"{cls.__name__} does not train and has to define compute()")
 
     @classmethod
@@ -57,7 +59,8 @@ class Stage:
 
     @classmethod
     def hand_on(cls, run: RunContext, value: Any, **given: Any) -> dict[str, Any]:
-        """What later phases find, by name; also in a run that took the result from its file. May change the run's scene."""
+        """What later phases find, by name; also in a run that took the result from its file. May change the run's
+        scene."""
         return {cls.gives: value}
 
     @classmethod

@@ -22,6 +22,7 @@ from p2gs.ops.carry import RigidMoves
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
 
+
 @dataclass
 class TuneConfig:
     """Options of the last fit of the Gaussians. steps: over both states, in turn (0 = off).  levels: image sizes (long edge, pixels), of

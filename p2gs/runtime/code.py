@@ -1,6 +1,8 @@
-"""A fingerprint of the code that makes a result: the syntax trees of a module and of all that it imports of its own package.
+"""A fingerprint of the code that makes a result: the syntax trees of a module and of all that it imports of its own
+package.
 
-Comments, docstrings and layout do not count. A tree is as its source, so trees' fingerprints are kept by the source's hash.
+Comments, docstrings and layout do not count. A tree is as its source, so trees' fingerprints are kept by the source's
+hash.
 """
 
 from __future__ import annotations
@@ -18,31 +20,34 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Iterable, Optional
 
-COMMENTS = re.compile(rb"//[^\n]*|/\*.*?\*/", re.S)  # of C++; a string that looks like one changes nothing but the fingerprint's grain
+COMMENTS = re.compile(rb"//[^\n]*|/\*.*?\*/", re.S)  # of C++, where no string holds what looks like one
 NATIVE = "p2gs.native"
 MOST_KEPT = 2000  # sources in the cache
 
 
 @dataclass(frozen=True)
 class Source:
-    """tree: hash of a file's syntax tree.  imports: dotted names it imports, those inside functions too; of ``from a import b`` a.b."""
+    """tree: hash of a file's syntax tree.  imports: dotted names it imports, those inside functions too; of ``from a
+    import b`` a.b."""
 
     tree: str
     imports: tuple[str, ...]
 
 
 class CodeReader:
-    """Reads each source file once; what has been read before by any run comes from the user's cache folder, where there is one."""
+    """Reads each source file once; what has been read before by any run comes from the user's cache folder, where there
+    is one."""
 
     def __init__(self) -> None:
         self.sources: dict[str, Optional[Source]] = {}  # by module
         self.cache = TreeCache()
 
     def code_of(self, modules: Iterable[str]) -> dict[str, str]:
-        """Module -> hash for the given modules and all modules of the same top-level packages that they import, directly or not.
+        """Module -> hash for the given modules and all modules of the same top-level packages that they import,
+        directly or not.
 
-        A plugin's module counts with those that lie beside it. A parent package's ``__init__`` counts only where it is imported itself.
-        Modules without source (built interactively) are left out.
+        A plugin's module counts with those that lie beside it. A parent package's ``__init__`` counts only where it is
+        imported itself. Modules without source (built interactively) are left out.
         """
         found: dict[str, str] = {}
         todo = list(modules)
@@ -58,7 +63,8 @@ class CodeReader:
         return found
 
     def source(self, name: str) -> Optional[Source]:
-        """Of a module, its imports narrowed to modules of the same package, of p2gs, or beside it; None where it has no source."""
+        """Of a module, its imports narrowed to modules of the same package, of p2gs, or beside it; None where it has no
+        source."""
         if name not in self.sources:
             path = module_file(name)
             source = None if path is None else self.cache.of(path)
@@ -91,7 +97,8 @@ def module_file(name: str) -> Optional[Path]:
 
 
 def _beside(name: str, path: Path) -> bool:
-    """Whether the top of a dotted name is a file or package in the folder of ``path``, outside of installed packages."""
+    """Whether the top of a dotted name is a file or package in the folder of ``path``, outside of installed
+    packages."""
     top = path.parent / name.split(".")[0]
     return "site-packages" not in path.parts and (top.with_suffix(".py").is_file() or (top / "__init__.py").is_file())
 
@@ -105,7 +112,10 @@ def read_source(text: bytes) -> Source:
             imports |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             imports |= {f"{node.module}.{alias.name}" for alias in node.names}
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) and ast.get_docstring(node, False) is not None:
+        if (
+            isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
+            and ast.get_docstring(node, False) is not None
+        ):
             node.body = node.body[1:]
     return Source(_digest(ast.dump(tree).encode()), tuple(sorted(imports)))
 

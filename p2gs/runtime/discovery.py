@@ -15,7 +15,8 @@ from p2gs.models.stage import Stage, register_phase
 
 @register_phase("discovery")
 class DiscoveryStage(DiscoveryOptions, Stage):
-    """Parts and motions, from the reconstructions of both states and the photographs. Takes the place of the bare options."""
+    """Parts and motions, from the reconstructions of both states and the photographs. Takes the place of the bare
+    options."""
 
     needs = ("states",)
     gives = "motions"

@@ -1,4 +1,5 @@
-"""The last stage of a run: the twin, its diagnosis and the result folder. Here, not in ``models``, because it writes exports."""
+"""The last stage of a run: the twin, its diagnosis and the result folder. Here, not in ``models``, because it writes
+exports."""
 
 from __future__ import annotations
 
@@ -46,7 +47,15 @@ class FinishStage(Stage):
         backend = {"backend": run.backend, "twin_backend": run.rasterizer, "device": run.device}
         losses = run.losses("articulation")
         obj, notes, record = finish(
-            learned, states, run.views, config, run.scene.similarity, losses, seed=run.seed, contents=in_trays, **backend
+            learned,
+            states,
+            run.views,
+            config,
+            run.scene.similarity,
+            losses,
+            seed=run.seed,
+            contents=in_trays,
+            **backend,
         )
         for note in notes:
             print(note, flush=True)

@@ -1,4 +1,5 @@
-"""What decides a stage's result, as plain values by name: options, code, the scene's files. Its hash is the stage's key."""
+"""What decides a stage's result, as plain values by name: options, code, the scene's files. Its hash is the stage's
+key."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ from p2gs.runtime.code import CodeReader
 from p2gs.trainer_options import callback_modules, decides_result
 
 MOST_TOLD = 3  # differences in a sentence
+LIBRARIES = ("torch", "lightning", "typing", "abc")  # of which phases inherit; their code counts as given
 Parts = dict[str, Any]
 
 
@@ -57,7 +59,7 @@ class StageKeys:
         makers = {*phase.__mro__, *map(type, section.losses.values())}
         makers |= {type(c) for c in section.callbacks.values() if c.changes_result}
         own = {make.__module__ for make in makers} - {"builtins"}
-        return {m for m in own if m.split(".")[0] not in ("torch", "lightning", "typing", "abc")} | {"p2gs.runtime.training"}
+        return {m for m in own if m.split(".")[0] not in LIBRARIES} | {"p2gs.runtime.training"}
 
     @cached_property
     def files(self) -> dict[str, str]:
@@ -109,7 +111,8 @@ def rasterizer_module(name: str) -> str:
 
 
 def scene_files(files: Iterable[Path], root: Path, cache: Path) -> dict[str, str]:
-    """Path -> hash of each file's bytes, paths below ``root`` told from there. cache: where hashes are kept by size and time of change."""
+    """Path -> hash of each file's bytes, paths below ``root`` told from there. cache: where hashes are kept by size and
+    time of change."""
     try:
         known = json.loads(cache.read_text())
     except (OSError, ValueError):

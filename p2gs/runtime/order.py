@@ -11,8 +11,8 @@ from p2gs.types import UserError
 
 
 def stage_order(run: RunContext) -> dict[str, type[Stage]]:
-    """Name -> phase for the config's ``stages``. Raises UserError for a name that is unknown, given twice or without options, for a phase
-    with options that is no stage, and for one whose ``needs`` no stage before it hands over.
+    """Name -> phase for the config's ``stages``. Raises UserError for a name that is unknown, given twice or without
+    options, for a phase with options that is no stage, and for one whose ``needs`` no stage before it hands over.
     """
     names, phases = run.cfg.stages, run.cfg.phases
     for name in names:
@@ -23,8 +23,8 @@ def stage_order(run: RunContext) -> dict[str, type[Stage]]:
     missing = [name for name in names if name not in phases]
     if missing:
         raise UserError(
-            f"phases.{missing[0]} is not in the config; expected options ({{}} for its defaults) of each of the stages {', '.join(names)} "
-            "(start from -c configs/preset/cpu.yaml)"
+            f"phases.{missing[0]} is not in the config; expected options ({{}} for its defaults) of each of the stages "
+            f"{', '.join(names)} (start from -c configs/preset/cpu.yaml)"
         )
     idle = [name for name in phases if name not in names]
     if idle:
@@ -48,9 +48,11 @@ def stage_order(run: RunContext) -> dict[str, type[Stage]]:
 def check_declaration(name: str, phase: Any) -> None:
     """Raise UserError where a registered class does not say how it takes part in a run."""
     if not (isinstance(phase, type) and issubclass(phase, Stage)):
-        raise UserError(f"phase '{name}': {phase.__name__} is no Stage; expected a subclass of p2gs.models.phase.Phase or Stage")
+        expected = "a subclass of p2gs.models.phase.Phase or Stage"
+        raise UserError(f"phase '{name}': {phase.__name__} is no Stage; expected {expected}")
     if not phase.gives:
         raise UserError(f"phase '{name}': {phase.__name__} does not say what it hands over (gives = \"NAME\")")
     hook = "build" if phase.trained else "compute"
     if getattr(phase, hook).__func__ is getattr(Stage, hook).__func__:
-        raise UserError(f"phase '{name}': {phase.__name__} {'trains' if phase.trained else 'does not train'} and has to define {hook}()")
+        does = "trains" if phase.trained else "does not train"
+        raise UserError(f"phase '{name}': {phase.__name__} {does} and has to define {hook}()")

@@ -18,7 +18,8 @@ from p2gs.trainer_options import trainer_arguments
 
 
 def train(run: RunContext, cls: type[Stage], stage: str, section: Any, key: str, given: dict) -> Any:
-    """What the phase hands over. stage: its name in the result folder (``single_state_0``).  section: its part of the config."""
+    """What the phase hands over. stage: its name in the result folder (``single_state_0``).  section: its part of the
+    config."""
     seed_everything(run.seed, verbose=False)
     phase: Phase = cls.build(run, section, **given)
     phase.phase_name = stage
@@ -35,7 +36,8 @@ def train(run: RunContext, cls: type[Stage], stage: str, section: Any, key: str,
         max_steps=phase.total_steps,
         accelerator="gpu" if run.device.type == "cuda" else "cpu",
         default_root_dir=run.run_dir,
-        plugins=[LightningEnvironment()],  # on SLURM, too: a run is one process, and resumes from its own checkpoints alone
+        # on SLURM, too: a run is one process, and resumes from its own checkpoints alone
+        plugins=[LightningEnvironment()],
         **arguments,
     )
     with at_step_ends():

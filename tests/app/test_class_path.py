@@ -1,4 +1,5 @@
-"""Losses, callbacks and data of the user's by class_path and init_args, and the round trip through a run's config.yaml."""
+"""Losses, callbacks and data of the user's by class_path and init_args, and the round trip through a run's
+config.yaml."""
 
 import json
 import sys
@@ -9,7 +10,7 @@ import yaml
 from p2gs.config import load_config, save_config
 from p2gs.types import UserError
 
-CLASSES = '''
+CLASSES = """
 from p2gs.callbacks.base import Callback
 from p2gs.data.base import TwoStateData
 from p2gs.losses.base import Loss
@@ -30,7 +31,7 @@ class Folder(TwoStateData):
 
 class Stranger:
     pass
-'''
+"""
 
 
 @pytest.fixture
@@ -95,12 +96,21 @@ def test_a_runs_config_is_read_back(desk, monkeypatch):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("phases: {sharpen: {losses: {even: {class_path: own_classes.Odd}}}}", "class_path 'own_classes.Odd' cannot be imported"),
+        (
+            "phases: {sharpen: {losses: {even: {class_path: own_classes.Odd}}}}",
+            "class_path 'own_classes.Odd' cannot be imported",
+        ),
         ("phases: {sharpen: {losses: {even: {class_path: nothere.Even}}}}", "No module named 'nothere'"),
         ("phases: {sharpen: {losses: {even: {class_path: own_classes.Stranger}}}}", "is no p2gs.losses.base.Loss"),
-        ("phases: {sharpen: {losses: {render: {class_path: own_classes.Even}}}}", "'render' is the name of a loss already"),
+        (
+            "phases: {sharpen: {losses: {render: {class_path: own_classes.Even}}}}",
+            "'render' is the name of a loss already",
+        ),
         ("phases: {sharpen: {losses: {even: {class_path: own_classes.Even, init_args: {powr: 1}}}}}", "did you mean"),
-        ("phases: {sharpen: {losses: {even: {class_path: own_classes.Even, init_args: 3}}}}", "init_args: {NAME: VALUE}"),
+        (
+            "phases: {sharpen: {losses: {even: {class_path: own_classes.Even, init_args: 3}}}}",
+            "init_args: {NAME: VALUE}",
+        ),
         ("callbacks: {count: {class_path: lightning.pytorch.callbacks.Timer}}", "is no p2gs.callbacks.base.Callback"),
         ("data: {class_path: own_classes.Even}", "is no p2gs.data.base.TwoStateData"),
         ("data: {format: own_classes.Foldr, root: x}", "cannot be imported"),

@@ -19,7 +19,10 @@ def test_nothing_given_is_tensorboard_alone(tmp_path):
 
 def test_loggers_callbacks_and_profiler_by_class(tmp_path):
     options = {
-        "logger": [{"class_path": "CSVLogger"}, {"class_path": "lightning.pytorch.loggers.TensorBoardLogger", "init_args": {"name": "mine"}}],
+        "logger": [
+            {"class_path": "CSVLogger"},
+            {"class_path": "lightning.pytorch.loggers.TensorBoardLogger", "init_args": {"name": "mine"}},
+        ],
         "callbacks": [{"class_path": "lightning.pytorch.callbacks.Timer", "init_args": {"interval": "epoch"}}],
         "profiler": "simple",
         "detect_anomaly": True,
@@ -78,7 +81,12 @@ def test_in_a_config(tmp_path):
 
 
 def test_only_what_may_change_the_result_decides_it():
-    watching = {"logger": {"class_path": "CSVLogger"}, "profiler": "simple", "enable_progress_bar": True, "precision": 32}
+    watching = {
+        "logger": {"class_path": "CSVLogger"},
+        "profiler": "simple",
+        "enable_progress_bar": True,
+        "precision": 32,
+    }
     assert decides_result(watching) == {}
     assert decides_result({"deterministic": True}) == {"deterministic": True}
     own = {"callbacks": [{"class_path": "mine.Swa"}, {"class_path": "lightning.pytorch.callbacks.Timer"}]}

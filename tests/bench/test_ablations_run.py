@@ -56,7 +56,10 @@ def states_and_motions(parts: int = 2) -> tuple[list[StateGaussians], PartMotion
 
 
 def run_two_steps(preset: str, name: str, scene: str, run: Path, *words: str) -> tuple[Pipeline, ArticulationPhase, handover.Articulation]:
-    """Pipeline, trained phase, and what it handed over: fusion and articulation of a config, two steps each where it takes steps at all, from reconstructions and motions that are given."""
+    """Pipeline, trained phase, and what it handed over.
+
+    Fusion and articulation of a config, two steps each where it takes steps at all, from reconstructions and motions that are given.
+    """
     words = ["--data.root", scene, "--run", str(run), *TINY, *words]
     plain = load_config([f"preset/{preset}.yaml", f"ablation/{name}.yaml"], words)
     words += ["--num_parts", "3"] if plain.num_parts == "auto" else []

@@ -7,11 +7,12 @@ import pytest
 import torch
 import trimesh
 
+from p2gs.data.generate import synthesize
 from p2gs.data.ground_truth import load_ground_truth
 from p2gs.data.modules import DATASETS, SyntheticData
 from p2gs.data.raytrace import Shadow, render
 from p2gs.data.shapes import Primitive, ball, box, cylinder
-from p2gs.data.synthetic import KINDS, cabinet, intrinsics, look_at, make_object, render_view, synthesize, train_cameras
+from p2gs.data.synthetic import KINDS, cabinet, intrinsics, look_at, make_object, render_view, train_cameras
 from p2gs.data.textures import PATTERNS, Texture
 from p2gs.data.write import write_scene
 from p2gs.types import UserError

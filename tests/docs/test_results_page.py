@@ -34,7 +34,7 @@ def run(tmp_path_factory):
     import trimesh
 
     from p2gs.config import load_config
-    from p2gs.data.synthetic import synthesize
+    from p2gs.data.generate import synthesize
     from p2gs.export.mesh import write_mesh
     from p2gs.export.run_folder import write_twin
     from p2gs.export.tsdf import Mesh

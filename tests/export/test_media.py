@@ -6,10 +6,11 @@ import torch
 from toy import ring, toy_scene, toy_twin
 
 from p2gs.export.frame import object_to_input
-from p2gs.export.media import framed, render_parts, render_plain, render_states
+from p2gs.export.media import framed, render_parts, render_plain
 from p2gs.export.paint import draw, joint_strokes, part_coloured
 from p2gs.export.pose import pose
 from p2gs.export.run_folder import write_twin
+from p2gs.export.states import render_states
 from p2gs.export.twin_json import load_twin
 from p2gs.export.views import best_camera, bounds, orbit, point_labels, read_cameras, scene_cameras
 from p2gs.ops.palette import part_colour

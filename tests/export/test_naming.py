@@ -9,9 +9,10 @@ from boxed import boxed_run
 from test_clearance import slide, turn
 
 from p2gs.app import run as p2gs
-from p2gs.export.asset import Asset, Hinge, Link
+from p2gs.export.asset import Asset
 from p2gs.export.formats import export_run
 from p2gs.export.inertia import Inertia
+from p2gs.export.links import Hinge, Link
 from p2gs.export.naming import parse_names, with_names
 from p2gs.export.tsdf import Mesh
 from p2gs.types import UserError
@@ -107,7 +108,7 @@ def test_names_reach_every_file_and_not_the_runs_own(cabinet, tmp_path, capsys):
 
 
 def test_usd_carries_labels_that_openusd_reads(cabinet, tmp_path):
-    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[usd])")
+    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[validate])")
     from pxr import Usd, UsdGeom
 
     UsdSemantics = pytest.importorskip("pxr.UsdSemantics", reason="usd-core before 24.11 knows no labels")

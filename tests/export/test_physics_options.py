@@ -64,7 +64,7 @@ def test_mass_goes_by_the_material(run):
 
 
 def test_usd_meshes_have_extents_and_normals(run, tmp_path):
-    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[usd])")
+    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[validate])")
     from pxr import Usd, UsdGeom
 
     assert p2gs(["export", str(run), "--format", "usd", "--out", str(tmp_path)]) == 0

@@ -100,7 +100,7 @@ def test_sapien_loads_partnets_files(partnet):
 
 
 def test_simready_has_its_folders_metadata_labels_and_thumbnail(run, tmp_path):
-    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[usd])")
+    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[validate])")
     from pxr import Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation
 
     written = export_profile(run, "simready", tmp_path, run / "meta.yaml", material="wood")
@@ -220,7 +220,7 @@ def test_limits_of_effort_and_speed_go_by_weight_and_range(tmp_path):
 
 
 def test_usd_joints_are_damped_as_the_others_are(tmp_path):
-    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[usd])")
+    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[validate])")
     from pxr import Usd, UsdPhysics
 
     asset = Asset("cabinet", with_looks(cabinet()), "z")

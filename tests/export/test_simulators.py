@@ -176,7 +176,7 @@ def test_usd_text_is_complete(run, joints):
 
 
 def test_usd_opens_in_usd_core_and_agrees_with_the_twin(run, joints):
-    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[usd])")
+    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[validate])")
     from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
     stage = Usd.Stage.Open(str(run / "twin.usda"))

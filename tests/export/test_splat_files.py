@@ -115,7 +115,7 @@ def test_readers_that_do_not_know_splats_show_coloured_points(tmp_path):
 
 
 def test_usd_has_the_gaussians_under_their_rigid_body(tmp_path):
-    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[usd])")
+    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[validate])")
     from pxr import Usd, UsdGeom, UsdValidation, UsdVol
 
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):

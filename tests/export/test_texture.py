@@ -137,7 +137,7 @@ def test_simulators_and_usd_find_the_pictures(run, tmp_path):
     assert (model.geom_matid[model.geom_group == 2] >= 0).all()
     robot = yourdfpy.URDF.load(str(run / "twin.urdf"))
     assert all(g.visual.kind == "texture" for g in robot.scene.geometry.values())
-    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[usd])")
+    pytest.importorskip("pxr", reason="usd-core is not installed (pip install p2gs[validate])")
     from pxr import Usd, UsdGeom, UsdShade
 
     stage = Usd.Stage.Open(str(run / "twin.usda"))

@@ -1,4 +1,5 @@
-"""A stranger's phase, loss, callback, dataset and rasterizer, each one file of theirs, through fit, test, export, predict and bench."""
+"""A stranger's phase, loss, callback, dataset and rasterizer, each one file of theirs, through fit, test, export,
+predict and bench."""
 
 import json
 import os
@@ -74,10 +75,10 @@ num_parts: 3
 data: {depth: never}
 stages: [single_state, registration, discovery, sharpen, canonical_fusion, colours, articulation, finish]
 phases:
-  single_state: {steps: 150, initial_gaussians: 1500, levels: [32, 64], level_starts: [0.0, 0.3], losses: {own_grey: {weight: 0.01}},
-    callbacks: {densify: {budget: 2000, every: 20}}}
-  discovery: {evidence_size: 64, reconsider: false, rounds: 1, split_reach: 0, survey: [], coarse: {steps: 5, levels: [64]},
-    search: {surfels: 1500, samples: 80, searches: 1, candidates: 1}}
+  single_state: {steps: 150, initial_gaussians: 1500, levels: [32, 64], level_starts: [0.0, 0.3], losses: {own_grey:
+    {weight: 0.01}}, callbacks: {densify: {budget: 2000, every: 20}}}
+  discovery: {evidence_size: 64, reconsider: false, rounds: 1, split_reach: 0, survey: [], coarse: {steps: 5, levels:
+    [64]}, search: {surfels: 1500, samples: 80, searches: 1, candidates: 1}}
   canonical_fusion: {steps: 6, levels: [64], level_starts: [0.0], canonical: {match_size: 300}}
   colours: {steps: 6, levels: [64], level_starts: [0.0], losses: {render: {}}, callbacks: {joint_log: {every: 2}}}
   articulation: {steps: 6, levels: [64], level_starts: [0.0], callbacks: {joint_log: {every: 3}}}
@@ -99,7 +100,13 @@ def desk(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("own")
     pages = {"my_phases.py": "add_phase.md", "my_callbacks.py": "add_callback.md"}  # the docs' own examples
     texts = {name: next(b.text for b in blocks(REPO / "docs" / page) if b.title == name) for name, page in pages.items()}
-    texts |= {"my_losses.py": LOSS, "my_data.py": DATA, "my_rasterizers.py": RASTERIZER, "own.yaml": OWN, "bench.yaml": BENCH}
+    texts |= {
+        "my_losses.py": LOSS,
+        "my_data.py": DATA,
+        "my_rasterizers.py": RASTERIZER,
+        "own.yaml": OWN,
+        "bench.yaml": BENCH,
+    }
     texts["scenes/cabinet/recipe.json"] = json.dumps({"size": 64, "views": 10})
     for name, text in texts.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -22,7 +22,7 @@ callbacks: {{checkpoint: null, scalars: null, previews: null, evaluation: null, 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    from p2gs.data.synthetic import synthesize
+    from p2gs.data.generate import synthesize
 
     return synthesize(tmp_path_factory.mktemp("keys") / "scene", 0, "demo", 24, 3, 1)
 
@@ -44,12 +44,18 @@ def lines(capsys) -> list[str]:
 
 
 def test_changes_are_told_in_words():
-    old = flat("phases", {"sharpen": {"steps": 600, "rates": {}}}) | {"file start/0.png": "a", "code of p2gs.x": "1", "gone": 3}
-    new = flat("phases", {"sharpen": {"steps": 20, "rates": {}}}) | {"file start/0.png": "b", "code of p2gs.x": "2", "file new.png": "c"}
+    old = flat("phases", {"sharpen": {"steps": 600, "rates": {}}}) | {
+        "file start/0.png": "a",
+        "code of p2gs.x": "1",
+        "gone": 3,
+    }
+    new = flat("phases", {"sharpen": {"steps": 20, "rates": {}}}) | {
+        "file start/0.png": "b",
+        "code of p2gs.x": "2",
+        "file new.png": "c",
+    }
     said = changes(old, new)
-    assert said == (
-        "phases.sharpen.steps was 600, is 20; the scene's file start/0.png changed; the code of p2gs.x changed; and 2 more"
-    )
+    assert said == ("phases.sharpen.steps was 600, is 20; the scene's file start/0.png changed; the code of p2gs.x changed; and 2 more")
     assert changes(old, old) == "" and changes({"a": None}, {"a": None}) == ""
 
 

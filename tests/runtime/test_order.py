@@ -44,10 +44,18 @@ def test_the_order_is_the_configs(phases):
     [
         (["first", "secnd"], None, "there is no phase 'secnd' (did you mean 'second'?)"),
         (["first", "first"], None, "'first' is named twice"),
-        (["second", "first"], None, "second needs 'a', which no stage before it hands over (first does, and comes later)"),
+        (
+            ["second", "first"],
+            None,
+            "second needs 'a', which no stage before it hands over (first does, and comes later)",
+        ),
         (["first", "third"], None, "third needs 'b', which no stage before it hands over"),
         (["first", "second"], ["first"], "phases.second is not in the config"),
-        (["first"], ["first", "second"], "phases.second is in the config but not among the stages (first), so it would never run"),
+        (
+            ["first"],
+            ["first", "second"],
+            "phases.second is in the config but not among the stages (first), so it would never run",
+        ),
     ],
 )
 def test_what_cannot_work_is_told(phases, stages, options, message):
@@ -66,7 +74,11 @@ def test_a_class_that_does_not_say_how_it_takes_part_is_named(phases):
         gives = "c"
 
     PHASES.register("foreign")(type("Foreign", (), {}))
-    for name, message in (("silent", "does not say what it hands over"), ("idle", "has to define compute"), ("foreign", "is no Stage")):
+    for name, message in (
+        ("silent", "does not say what it hands over"),
+        ("idle", "has to define compute"),
+        ("foreign", "is no Stage"),
+    ):
         with pytest.raises(UserError, match=message):
             stage_order(run("first", name))
 
@@ -81,4 +93,12 @@ def test_the_built_in_phases_fit_together():
 
     import_builtins()
     order = stage_order(run(*STAGES))
-    assert [p.gives for p in order.values()] == ["states", "states", "motions", "sharpened", "canonical", "learned", "twin"]
+    assert [p.gives for p in order.values()] == [
+        "states",
+        "states",
+        "motions",
+        "sharpened",
+        "canonical",
+        "learned",
+        "twin",
+    ]

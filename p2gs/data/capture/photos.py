@@ -12,12 +12,13 @@ from typing import Optional
 
 import numpy as np
 
+from p2gs.data.capture.sharpness import MIN_PHOTOS, sharpness
+from p2gs.data.capture.video import sharp_frames
 from p2gs.types import UserError
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 HEIC = (".heic", ".heif")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-MIN_PHOTOS = 8
 BLURRED = 1 / 3  # of the median sharpness: below it a photograph shows less than half of the detail of its neighbours
 EXIF_ORIENTATION, EXIF_MODEL, EXIF_IFD, EXIF_FOCAL_35, EXIF_FOCAL = 0x0112, 0x0110, 0x8769, 0xA405, 0x920A
 FILM_DIAGONAL = 43.27  # mm; lenses' "35 mm equivalent" compares diagonals
@@ -80,8 +81,6 @@ def copy_photos(source: Path, state: str, folder: Path, size: int, limit: int) -
     Raises UserError for a file that cannot be read, naming it.
     """
     if source.is_file() and source.suffix.lower() in VIDEOS:
-        from p2gs.data.capture.video import sharp_frames
-
         return [store(frame, f"{source}#{t:.2f}s", None, "video", state, i, folder, size)
                 for i, (t, frame) in enumerate(sharp_frames(source, limit))]  # fmt: skip
     paths = listed(source)
@@ -141,17 +140,6 @@ def store(pixels, source: str, focal, device: str, state: str, index: int, folde
         cv2.imwrite(str(folder / alpha), pixels[..., 3])
     focal = None if focal is None else focal * factor
     return Shot(name, source, width, height, focal, device, sharpness(pixels), alpha)
-
-
-def sharpness(pixels: np.ndarray) -> float:
-    """Variance of the Laplacian of [H, W, 3|4] uint8 at a long edge of 640 px."""
-    import cv2
-
-    grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
-    factor = 640 / max(grey.shape)
-    if factor < 1:
-        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
 def drop_blurred(shots: list[Shot]) -> tuple[list[Shot], dict[str, str]]:

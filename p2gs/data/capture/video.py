@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from p2gs.data.capture.sharpness import MIN_PHOTOS, sharpness
 from p2gs.types import UserError
 
 LOOKED_AT = 3  # frames per kept one: a shaken hand is still somewhere in a stretch
@@ -14,8 +15,6 @@ LOOKED_AT = 3  # frames per kept one: a shaken hand is still somewhere in a stre
 def sharp_frames(path: Path, count: int) -> list[tuple[float, np.ndarray]]:
     """(time in seconds, upright RGB [H, W, 3]) of ``count`` frames. Raises UserError where the video cannot be read or is too short."""
     import cv2
-
-    from p2gs.data.capture.photos import MIN_PHOTOS, sharpness
 
     video = cv2.VideoCapture(str(path))
     total = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
