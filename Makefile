@@ -1,4 +1,4 @@
-# make setup | demo | test | fuzz | faults | sanitize | clean.  PYTHON chooses the interpreter that .venv is made of.
+# make setup | demo | lint | test | fuzz | faults | sanitize | clean.  PYTHON chooses the interpreter that .venv is made of.
 PYTHON ?= python3
 BIN := .venv/bin
 NATIVE := $(wildcard p2gs/native/*.cpp p2gs/native/*.h p2gs/native/*.inc)
@@ -6,7 +6,7 @@ PLATLIB = $(shell $(BIN)/python -c "import sysconfig; print(sysconfig.get_path('
 # Idle threads of torch spin by default, on cores that the kernels want.
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: setup setup-dev native demo test faults fuzz sanitize clean
+.PHONY: setup setup-dev native demo lint test faults fuzz sanitize clean
 
 setup: .venv/.built
 
@@ -41,6 +41,13 @@ demo: setup
 
 test: setup-dev
 	$(BIN)/python -m pytest --timeout=300
+
+# Style, layout, types of the rooms that pass, and which way imports point: under a minute.
+lint: setup-dev
+	$(BIN)/ruff check p2gs tests bench
+	$(BIN)/ruff format --check p2gs tests bench
+	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/python -m pytest -q tests/test_imports.py
 
 # Kills, full disks, damaged files: KILLS is how many times a run is killed. Hours at 100.
 faults: setup-dev

@@ -82,15 +82,17 @@ def plain_sections(tree: Plain, where: str) -> Plain:
         out["phases"] = dict(out["phases"])
         for name, phase in out["phases"].items():
             if isinstance(phase, dict):
-                kinds = {"losses": (LOSSES, Loss), "callbacks": (CALLBACKS, Callback)}
-                found = {k: named(phase[k], *kinds[k], f"phases.{name}.{k}.") for k in kinds if k in phase}
-                out["phases"][name] = {**phase, **found}
+                found = dict(phase)
+                for kind, registry, base in (("losses", LOSSES, Loss), ("callbacks", CALLBACKS, Callback)):
+                    if kind in phase:
+                        found[kind] = named(phase[kind], registry, base, f"phases.{name}.{kind}.")
+                out["phases"][name] = found
     data = out.get("data")
     given = given_class(data, f"{where}data")
     path = given[0] if given is not None else data.get("format") if isinstance(data, dict) else None
     if isinstance(path, str) and "." in path and path not in DATASETS:
         register_class(path, path, DATASETS, TwoStateData, f"{where}data")
-    if given is not None:
+    if given is not None and data is not None:
         rest = {k: v for k, v in data.items() if k not in ("class_path", "init_args")}
         out["data"] = {"format": path, **given[1], **rest}
     return out
@@ -132,7 +134,7 @@ def instance(value: Any, base: type, where: str, **defaults: Any) -> Any:
         config = parser.parse_object({"value": {"class_path": path, "init_args": args}})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # jsonargparse's own, of the method's coming name
-            return parser.instantiate_classes(config).value
+            return parser.instantiate_classes(config)["value"]
     except UserError:
         raise
     except Exception as err:

@@ -19,5 +19,6 @@ def machine_says(err: BaseException) -> str:
     """One sentence: which file, and why not."""
     if isinstance(err, MemoryError):
         return "there is not enough memory" + (f" ({' '.join(str(err).split())})" if str(err) else "")
-    where = f"{err.filename}: " if err.filename is not None else "a file of the result could not be written: "
-    return where + (err.strerror or str(err))
+    name, reason = getattr(err, "filename", None), getattr(err, "strerror", None)
+    where = "a file of the result could not be written: " if name is None else f"{name}: "
+    return where + (reason or str(err))

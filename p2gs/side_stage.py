@@ -60,6 +60,7 @@ class SideStage:
         self.reader.start()
 
     def _forward(self) -> None:
+        assert self.process.stdout is not None  # it is a pipe
         for line in self.process.stdout:
             self.last.append(line.rstrip("\n"))
             if not line.startswith(MISTAKE):
@@ -70,6 +71,7 @@ class SideStage:
         return self
 
     def __exit__(self, *exc) -> None:
+        assert self.process.stdin is not None  # it is a pipe
         self.process.stdin.close()
         try:
             self.process.wait(PATIENCE)

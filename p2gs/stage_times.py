@@ -28,4 +28,5 @@ def note_stage(run_dir: Path | str, name: str, seconds: float, peak_memory: int,
 
 def wall_seconds(stages: dict[str, dict]) -> float:
     """What the stages took together: one that ran beside another counts by how much longer it took."""
-    return sum(max(s["seconds"] - stages.get(s.get("beside"), {"seconds": 0.0})["seconds"], 0.0) for s in stages.values())
+    beside = {name: stages.get(s.get("beside", ""), {"seconds": 0.0}) for name, s in stages.items()}
+    return sum(max(s["seconds"] - beside[name]["seconds"], 0.0) for name, s in stages.items())

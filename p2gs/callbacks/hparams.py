@@ -108,7 +108,7 @@ def write_hparams(run: Path | str) -> Optional[Path]:
         old.unlink()
     with SummaryWriter(str(folder)) as writer:
         for summary in hparams(run_parameters(yaml.safe_load((run / "config.yaml").read_text())), scores):
-            writer.file_writer.add_summary(summary)
+            writer.file_writer.add_summary(summary)  # pyright: ignore[reportOptionalMemberAccess]
         for name, value in scores.items():
             writer.add_scalar(name, value)
     return folder

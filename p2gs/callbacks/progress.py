@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Optional
+from typing import Any
 
 from p2gs.callbacks.base import Callback, register_callback
 
@@ -42,7 +42,7 @@ class Progress(Callback):
     losses: int = 4
 
     def __post_init__(self):
-        self._live: Optional[object] = None
+        self._live: Any = None  # rich.live.Live
 
     def on_train_start(self, trainer, phase) -> None:
         self._started = self._shown = time.monotonic()

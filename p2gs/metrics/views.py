@@ -36,8 +36,8 @@ def evaluate_view(render: RenderOutput, view: View, diagonal: float) -> dict[str
     if inside.any():
         row["psnr_masked"] = psnr(white[inside], photo_white[inside])
     row["alpha_error"] = float((render.alpha - mask).abs().mean())
-    known = inside & (view.depth > 0) if view.depth is not None else torch.zeros(1, dtype=torch.bool)
-    if known.any():
+    known = None if view.depth is None else inside & (view.depth > 0)
+    if view.depth is not None and known is not None and known.any():
         off = (render.expected_depth - view.depth)[known].abs().numpy()
         row["depth_median"], row["depth_p90"] = (float(np.quantile(off, q)) for q in (0.5, 0.9))
         row["depth_bad"] = float((off > 0.01 * diagonal).mean())

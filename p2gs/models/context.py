@@ -80,7 +80,9 @@ class RunContext:
     @property
     def extent(self) -> float:
         """Diagonal of the object's box, internal units."""
-        return float((self.scene.box[1] - self.scene.box[0]).norm())
+        box = self.scene.box
+        assert box is not None  # every scene that is trained on has one
+        return float((box[1] - box[0]).norm())
 
     @property
     def views(self) -> dict[int, TrainingViews]:
@@ -101,7 +103,7 @@ class RunContext:
 
 def levels_of(config: Any) -> set[int]:
     """Every image size named in a config or in the configs inside it."""
-    sizes = set(getattr(config, "levels", ()))
+    sizes: set[int] = set(getattr(config, "levels", ()))
     for f in dataclasses.fields(config):
         value = getattr(config, f.name)
         if dataclasses.is_dataclass(value):

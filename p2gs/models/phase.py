@@ -62,7 +62,6 @@ class Phase(LightningModule, Stage):
 
     Config: type[PhaseConfig] = PhaseConfig
     trained = True
-    phase_name = "phase"
 
     def __init__(self, config: PhaseConfig, losses: dict[str, Loss], *, seed: int = 0, rasterizer: str = "auto"):
         super().__init__()

@@ -27,7 +27,8 @@ class Stage:
     once for the end, and its result is the list of both.  num_parts_matters: whether ``num_parts`` decides its result.
     """
 
-    Config: ClassVar[type]
+    Config: type
+    phase_name: str = "phase"
     trained: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()
     uses: ClassVar[tuple[str, ...]] = ()

@@ -66,9 +66,9 @@ class CodeReader:
         """Of a module, its imports narrowed to modules of the same package, of p2gs, or beside it; None where it has no
         source."""
         if name not in self.sources:
-            path = module_file(name)
-            source = None if path is None else self.cache.of(path)
-            if source is not None:
+            path, source = module_file(name), None
+            if path is not None:
+                source = self.cache.of(path)
                 roots = {name.split(".")[0], "p2gs"}
                 names = {t for target in source.imports for t in (target, target.rpartition(".")[0]) if t}
                 near = tuple(sorted(t for t in names if t.split(".")[0] in roots or _beside(t, path)))

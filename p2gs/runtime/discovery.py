@@ -14,9 +14,8 @@ from p2gs.models.stage import Stage, register_phase
 
 
 @register_phase("discovery")
-class DiscoveryStage(DiscoveryOptions, Stage):
-    """Parts and motions, from the reconstructions of both states and the photographs. Takes the place of the bare
-    options."""
+class DiscoveryStage(DiscoveryOptions, Stage):  # pyright: ignore[reportGeneralTypeIssues]
+    """Parts and motions, from both states' reconstructions and photographs. Takes the place of the bare options."""
 
     needs = ("states",)
     gives = "motions"

@@ -62,7 +62,7 @@ class FinishStage(Stage):
         stages = StageResults(found_in, motions, states, canonical, learned, record, notes)
         write_diagnosis(run.run_dir, stages, obj, run.views, min_margin=config.unclear, **backend)
         write_twin(obj, run.run_dir, run.scene)
-        if run.exact:
+        if run.exact and motions is not None:
             report = slot_report(learned, obj, record.slots, len(motions))
             (run.run_dir / "slots.json").write_text(json.dumps(report, indent=1) + "\n")
         if config.exports:

@@ -7,7 +7,7 @@ from typing import Any, Optional
 
 import torch
 from lightning.pytorch import Trainer, seed_everything
-from lightning.pytorch.plugins.environments import LightningEnvironment
+from lightning.pytorch.plugins.environments import LightningEnvironment  # pyright: ignore[reportPrivateImportUsage]
 
 from p2gs.models.context import RunContext
 from p2gs.models.phase import Phase
