@@ -19,8 +19,8 @@ from p2gs.export.pose import pose
 from p2gs.export.reach import extend_links
 from p2gs.export.simplify import simplify
 from p2gs.export.texture import Texture
-from p2gs.export.tsdf import Mesh
 from p2gs.export.twin_json import load_twin
+from p2gs.ops.mesh import Mesh
 from p2gs.ops.sh import rotate_sh
 from p2gs.ops.so3 import matrix_to_quat, quat_multiply
 from p2gs.types import GaussianTensors, Joint, UserError

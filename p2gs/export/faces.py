@@ -6,7 +6,7 @@ from typing import Optional
 
 import numpy as np
 
-from p2gs.export.tsdf import Mesh
+from p2gs.ops.mesh import Mesh
 
 
 class Faces:

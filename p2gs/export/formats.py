@@ -66,7 +66,7 @@ def splats(asset: Asset, out: Path) -> Path:
 def ply(asset: Asset, out: Path) -> Path:
     """parts/<link>.ply at the start state, vertex colours."""
     from p2gs.export.mesh import write_mesh
-    from p2gs.export.tsdf import Mesh
+    from p2gs.ops.mesh import Mesh
 
     folder = out / "parts"
     folder.mkdir(parents=True, exist_ok=True)

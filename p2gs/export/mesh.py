@@ -14,10 +14,10 @@ from p2gs.export.pieces import join_pieces
 from p2gs.export.protocol import largest_clusters, separate_whole, surface_options
 from p2gs.export.sightings import RESOLUTION, TRUNCATION, sight, start_motion
 from p2gs.export.trays import clear_way, complete_tray, not_the_trays
-from p2gs.export.tsdf import Mesh
 from p2gs.export.twin_json import load_twin
 from p2gs.export.unseen import close_unseen_sides
 from p2gs.export.views import NamedCamera, orbit, read_cameras
+from p2gs.ops.mesh import Mesh
 from p2gs.types import ArticulatedObject, Camera, UserError
 
 STATES = ("start", "end")

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from p2gs.export.depth_view import DepthView
 from p2gs.export.faces import Faces
-from p2gs.export.tsdf import Mesh, connected
 from p2gs.export.unique_rows import unique_rows
 from p2gs.export.unseen import NEAR, seen_empty, sewn
+from p2gs.ops.mesh import Mesh, connected
 
 LEAST = 0.1  # share of the largest piece's area that a piece has
 ALIKE = 0.6  # interquartile range of a section's length along a piece, in its median, up to which the section is the same all along

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from p2gs.export.faces import Faces, quantile
-from p2gs.export.tsdf import Mesh
+from p2gs.ops.mesh import Mesh
 
 UPRIGHT = 0.3  # cosine with the vertical up to which a triangle is a wall's
 OUTERMOST = 0.97  # quantile of a level's walls that is its edge: no knob moves it

@@ -11,7 +11,7 @@ import torch
 
 from p2gs.export.pose import pose
 from p2gs.export.sightings import RESOLUTION, sight
-from p2gs.export.tsdf import Mesh
+from p2gs.ops.mesh import Mesh
 from p2gs.types import ArticulatedObject, Camera, Part, UserError
 
 

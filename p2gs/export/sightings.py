@@ -13,10 +13,11 @@ from p2gs.export.paint import draw
 from p2gs.export.pose import part_transform, pose
 from p2gs.export.surface_depth import surface_depth
 from p2gs.export.trays import Tray, find_tray
-from p2gs.export.tsdf import Mesh, fuse, largest_components
+from p2gs.export.tsdf import fuse
 from p2gs.export.unseen import eyes_of
 from p2gs.export.views import bounds
 from p2gs.ops.blend import likeliest
+from p2gs.ops.mesh import Mesh, largest_components
 from p2gs.render.base import MAX_FEATURES
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from p2gs.export.tsdf import Mesh, vertex_normals
+from p2gs.export.tsdf import vertex_normals
 from p2gs.export.unique_rows import unique_rows
+from p2gs.ops.mesh import Mesh
 
 
 def simplify(mesh: Mesh, max_faces: int) -> Mesh:

@@ -17,9 +17,9 @@ from p2gs.export.integrate import integrate
 from p2gs.export.mesh import mesh_cameras
 from p2gs.export.paint import rasterizer_of
 from p2gs.export.sightings import BEHIND, TRUNCATION, Sightings, sight
-from p2gs.export.tsdf import Mesh
 from p2gs.export.twin_json import load_twin
 from p2gs.export.views import read_cameras
+from p2gs.ops.mesh import Mesh
 
 TILE = 8  # texels along a tile; the short edges of a triangle get TILE - 3
 

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from p2gs.export.depth_view import DepthView
 from p2gs.export.faces import Faces, quantile
-from p2gs.export.tsdf import Mesh
 from p2gs.export.unseen import NEAR, facing, grid_plane, seen_empty, sewn
+from p2gs.ops.mesh import Mesh
 
 FLAT = 0.8  # cosine with a direction from which a triangle faces it
 FRONT = 0.5  # share of its rectangle that a front fills

@@ -16,35 +16,9 @@ from torch import Tensor
 
 from p2gs.export.depth_view import DepthView, pixel_matrix, seen_points
 from p2gs.export.integrate import integrate
+from p2gs.ops.mesh import Mesh
 
 BLOCK = 4  # voxels; active space is kept in cubes of this side
-
-
-@dataclass
-class Mesh:
-    """vertices [V, 3] float64, faces [F, 3] int64, colours [V, 3] uint8."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    colours: np.ndarray
-
-    def transformed(self, T: np.ndarray) -> "Mesh":
-        return Mesh(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces, self.colours)
-
-    def without_unused(self) -> "Mesh":
-        """Without vertices that no triangle has."""
-        used, renumbered = np.unique(self.faces, return_inverse=True)
-        return Mesh(self.vertices[used], renumbered.reshape(-1, 3), self.colours[used])
-
-    @staticmethod
-    def join(meshes: Sequence["Mesh"]) -> "Mesh":
-        offsets = np.cumsum([0] + [len(m.vertices) for m in meshes])
-        faces = [m.faces + o for m, o in zip(meshes, offsets, strict=False)]
-        return Mesh(*(np.concatenate(x) for x in ([m.vertices for m in meshes], faces, [m.colours for m in meshes])))
-
-    @staticmethod
-    def empty() -> "Mesh":
-        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.uint8))
 
 
 def fuse(views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, trunc: float, behind: float) -> Mesh:
@@ -151,28 +125,3 @@ def fill_pinholes(field: np.ndarray, known: np.ndarray, enough: float = 14 / 27,
         new = ~known & (share > enough - 1e-3)
         field, known = np.where(new, mean, field), known | new
     return field, known
-
-
-def components(mesh: Mesh) -> np.ndarray:
-    """Connected component [F] of each triangle."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    f, n = mesh.faces, len(mesh.vertices)
-    graph = coo_matrix((np.ones(2 * len(f)), (np.r_[f[:, 0], f[:, 1]], np.r_[f[:, 1], f[:, 2]])), (n, n))
-    return connected_components(graph, directed=False)[1][f[:, 0]]
-
-
-def largest_components(mesh: Mesh, fraction: float = 0.1) -> Mesh:
-    """Without the connected components that have fewer than ``fraction`` of the largest one's triangles."""
-    if not len(mesh.faces):
-        return mesh
-    label = components(mesh)
-    count = np.bincount(label)
-    return Mesh(mesh.vertices, mesh.faces[count[label] >= fraction * count.max()], mesh.colours).without_unused()
-
-
-def connected(mesh: Mesh) -> list[Mesh]:
-    """The mesh's connected components."""
-    label = components(mesh)
-    return [Mesh(mesh.vertices, mesh.faces[label == k], mesh.colours).without_unused() for k in np.unique(label)]

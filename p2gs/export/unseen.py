@@ -15,9 +15,9 @@ from torch import Tensor
 
 from p2gs.export.depth_view import DepthView, pixel_matrix, pixels, seen_points
 from p2gs.export.plinth import plinth_height
-from p2gs.export.tsdf import Mesh
 from p2gs.export.unique_rows import unique_rows
 from p2gs.ops import se3
+from p2gs.ops.mesh import Mesh
 
 NEAR = 4.0  # voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges
 LEAST = 0.2  # share of a side of the box that must be unseen for it to be closed

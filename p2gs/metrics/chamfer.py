@@ -10,39 +10,26 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Mapping, Protocol, Sequence
+from typing import Mapping, Sequence
 
 import numpy as np
 
+from p2gs.ops.mesh import Mesh, Triangles, largest_components
+
 POINTS = 10_000
 SEEDS = (0, 1, 2)
-
-
-class Mesh(Protocol):
-    """vertices [V, 3] and triangles ``faces`` [F, 3], as trimesh.Trimesh has them."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-
-
-@dataclass(frozen=True)
-class PlainMesh:
-    """The least that is a mesh."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
 
 
 @dataclass(frozen=True)
 class PartMeshes:
     """One object in one state. static: the base.  movable: the moving parts.  whole: all of it; None joins the parts."""
 
-    static: Mesh | None
-    movable: Sequence[Mesh]
-    whole: Mesh | None = None
+    static: Triangles | None
+    movable: Sequence[Triangles]
+    whole: Triangles | None = None
 
     @property
-    def all(self) -> Mesh | None:
+    def all(self) -> Triangles | None:
         if self.whole is not None:
             return self.whole
         return join([m for m in (self.static, *self.movable) if m is not None])
@@ -69,7 +56,7 @@ class ChamferReport:
         return {k: {"value": v, "floor": self.floors[k]} for k, v in named.items()} | {"parts": self.parts, "failures": self.failures}
 
 
-def read_mesh(path: Path | str | None) -> Mesh | None:
+def read_mesh(path: Path | str | None) -> Triangles | None:
     """A mesh file that trimesh reads (ply, obj, stl, glb), scene graphs joined; None for no path or no such file."""
     import trimesh
 
@@ -78,21 +65,21 @@ def read_mesh(path: Path | str | None) -> Mesh | None:
 
 def read_part_meshes(whole: Path | str | None, static: Path | str | None, movable: Sequence[Path | str | None]) -> PartMeshes:
     """The meshes of one state from their files; a movable part without a file becomes an empty mesh (it keeps its number)."""
-    empty = PlainMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    empty = Mesh.empty()
     return PartMeshes(read_mesh(static), [read_mesh(m) or empty for m in movable], read_mesh(whole))
 
 
-def is_empty(mesh: Mesh | None) -> bool:
+def is_empty(mesh: Triangles | None) -> bool:
     """No mesh, no triangles, or no area."""
     return mesh is None or len(mesh.faces) == 0 or not surface_area(mesh) > 0
 
 
-def triangles(mesh: Mesh) -> np.ndarray:
+def triangles(mesh: Triangles) -> np.ndarray:
     """[F, 3, 3] float64."""
     return np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces, dtype=np.int64)]
 
 
-def surface_area(mesh: Mesh) -> float:
+def surface_area(mesh: Triangles) -> float:
     """Total area of the triangles."""
     return float(_areas(triangles(mesh)).sum())
 
@@ -101,38 +88,12 @@ def _areas(t: np.ndarray) -> np.ndarray:
     return 0.5 * np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=-1)
 
 
-def join(meshes: Sequence[Mesh]) -> PlainMesh | None:
+def join(meshes: Sequence[Triangles]) -> Mesh | None:
     """One mesh out of several; None out of none."""
-    if not meshes:
-        return None
-    offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
-    return PlainMesh(
-        np.concatenate([np.asarray(m.vertices, dtype=np.float64) for m in meshes]),
-        np.concatenate([np.asarray(m.faces, dtype=np.int64) + o for m, o in zip(meshes, offsets, strict=True)]),
-    )
+    return Mesh.join([Mesh.of(m) for m in meshes]) if meshes else None
 
 
-def largest_components(mesh: Mesh, fraction: float = 0.1) -> PlainMesh:
-    """The mesh without connected components that have fewer triangles than ``fraction`` of the largest.
-
-    Vertices at the same place count as one, so an unwelded mesh does not fall apart.
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    if len(faces) == 0:
-        return PlainMesh(vertices, faces)
-    _, place = np.unique(vertices, axis=0, return_inverse=True)
-    welded = place.reshape(-1)[faces]
-    ends = np.concatenate([welded[:, :2], welded[:, 1:]])
-    graph = coo_matrix((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(welded.max() + 1,) * 2)
-    label = connected_components(graph, directed=False)[1][welded[:, 0]]
-    size = np.bincount(label)
-    return PlainMesh(vertices, faces[size[label] >= fraction * size.max()])
-
-
-def sample_surface(mesh: Mesh, count: int, seed: int | Sequence[int] = 0) -> np.ndarray:
+def sample_surface(mesh: Triangles, count: int, seed: int | Sequence[int] = 0) -> np.ndarray:
     """Points uniform by area, [count, 3] float64; the same for the same seed. Raises ValueError for a mesh without area."""
     t = triangles(mesh)
     edges = np.cumsum(_areas(t))
@@ -169,7 +130,7 @@ def sampling_floor(area: float, count: int = POINTS) -> float:
     return 1000 * 2 * area / (math.pi * count)
 
 
-def mesh_chamfer(pred: Mesh, gt: Mesh, count: int = POINTS, seeds: Sequence[int] = SEEDS) -> float:
+def mesh_chamfer(pred: Triangles, gt: Triangles, count: int = POINTS, seeds: Sequence[int] = SEEDS) -> float:
     """1000 x the Chamfer distance of two surfaces, mean over the sampling seeds."""
     values = [chamfer_distance(sample_surface(pred, count, (s, 0)), sample_surface(gt, count, (s, 1))) for s in seeds]
     return 1000 * float(np.mean(values))
@@ -213,21 +174,21 @@ def evaluate_chamfer(
     dropped (ground truth is taken as it is, interior faces included); a whole that is its parts joined is what is left of these: a door
     may well have fewer triangles than a tenth of the base.
 
-    >>> box = PlainMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
-    >>> shift = PlainMesh(box.vertices + [0, 0, 0.1], box.faces)
+    >>> box = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
+    >>> shift = Mesh(box.vertices + [0, 0, 0.1], box.faces)
     >>> states = {"start": PartMeshes(box, [box])}, {"start": PartMeshes(box, [shift])}
     >>> report = evaluate_chamfer(*states, {0: 0})
     >>> 20 < report.movable < 20.1, report.static < 0.04
     (True, True)
     """
 
-    def score(p: Mesh | None, g: Mesh | None) -> float | None:
+    def score(p: Triangles | None, g: Triangles | None) -> float | None:
         return None if is_empty(p) or is_empty(g) else mesh_chamfer(p, g, count, seeds)
 
-    def cleaned(mesh: Mesh | None) -> Mesh | None:
-        return mesh if mesh is None or clean <= 0 else largest_components(mesh, clean)
+    def cleaned(mesh: Triangles | None) -> Triangles | None:
+        return mesh if mesh is None or clean <= 0 else largest_components(Mesh.of(mesh), clean, weld=True)
 
-    def floor(meshes: Sequence[Mesh | None]) -> list[float]:
+    def floor(meshes: Sequence[Triangles | None]) -> list[float]:
         return [mesh_chamfer(g, g, count, seeds) for g in meshes if not is_empty(g)]
 
     static, whole, parts = [], [], []

@@ -83,8 +83,9 @@ class PartChamfer(_Means):
     """Means of ``evaluate_chamfer`` over objects: static, movable, whole (x1000), failures (count).
 
     >>> import numpy as np
-    >>> from p2gs.metrics.chamfer import PartMeshes, PlainMesh
-    >>> tile = PlainMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
+    >>> from p2gs.metrics.chamfer import PartMeshes
+    >>> from p2gs.ops.mesh import Mesh
+    >>> tile = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
     >>> metric = PartChamfer()
     >>> metric.update({"start": PartMeshes(tile, [])}, {"start": PartMeshes(tile, [])}, {})
     >>> metric.compute()["static"].item() < 0.04

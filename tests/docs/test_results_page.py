@@ -37,7 +37,7 @@ def run(tmp_path_factory):
     from p2gs.data.generate import synthesize
     from p2gs.export.mesh import write_mesh
     from p2gs.export.run_folder import write_twin
-    from p2gs.export.tsdf import Mesh
+    from p2gs.ops.mesh import Mesh
 
     folder = tmp_path_factory.mktemp("results")
     scene = synthesize(folder / "scene", kind="demo", size=48, train_views=6, test_views=2)

@@ -11,7 +11,7 @@ from toy import toy_scene, toy_twin
 from p2gs.export.mesh import write_mesh
 from p2gs.export.pose import part_transform
 from p2gs.export.run_folder import write_twin
-from p2gs.export.tsdf import Mesh
+from p2gs.ops.mesh import Mesh
 
 WALL = 0.03
 SHELL = [

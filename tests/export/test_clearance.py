@@ -9,7 +9,7 @@ from p2gs.export.clearance import GAP, clear_links, without
 from p2gs.export.convex import Piece, cut, hull, separation
 from p2gs.export.inertia import Inertia
 from p2gs.export.links import Hinge, Link, joint_motion
-from p2gs.export.tsdf import Mesh
+from p2gs.ops.mesh import Mesh
 
 
 def block(lo, hi) -> Piece:

@@ -14,8 +14,8 @@ from p2gs.export.convex import decompose
 from p2gs.export.engines import ENGINES, check_engine, installed
 from p2gs.export.inertia import Inertia
 from p2gs.export.mjcf import write_mjcf
-from p2gs.export.tsdf import Mesh
 from p2gs.export.urdf import write_urdf
+from p2gs.ops.mesh import Mesh
 from p2gs.types import UserError
 
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from p2gs.export.faces import Faces, quantile
-from p2gs.export.tsdf import Mesh
+from p2gs.ops.mesh import Mesh
 
 
 def test_faces_are_where_and_as_large_as_trimesh_says_in_any_frame():

@@ -16,8 +16,9 @@ from p2gs.export.paint import part_coloured
 from p2gs.export.pose import pose
 from p2gs.export.run_folder import write_twin
 from p2gs.export.sightings import PartView, beside_others, fog_limit, look, start_motion, trust
-from p2gs.export.tsdf import ActiveGrid, Mesh, fuse, largest_components
+from p2gs.export.tsdf import ActiveGrid, fuse
 from p2gs.export.views import scene_cameras
+from p2gs.ops.mesh import Mesh, largest_components
 from p2gs.types import GaussianTensors, UserError
 
 EYE = torch.eye(4, dtype=torch.float64)

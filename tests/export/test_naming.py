@@ -14,7 +14,7 @@ from p2gs.export.formats import export_run
 from p2gs.export.inertia import Inertia
 from p2gs.export.links import Hinge, Link
 from p2gs.export.naming import parse_names, with_names
-from p2gs.export.tsdf import Mesh
+from p2gs.ops.mesh import Mesh
 from p2gs.types import UserError
 
 CYCLE = {"z": np.eye(3), "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), "y": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])}

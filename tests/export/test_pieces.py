@@ -8,7 +8,8 @@ from toy import ring
 from traced import boards, seen
 
 from p2gs.export.pieces import Piece, bridge, join_pieces
-from p2gs.export.tsdf import Mesh, connected, fuse, largest_components
+from p2gs.export.tsdf import fuse
+from p2gs.ops.mesh import Mesh, connected, largest_components
 
 VOXEL = 0.015
 SLIDE = 0.2

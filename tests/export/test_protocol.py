@@ -8,8 +8,8 @@ from p2gs.export.mesh import part_meshes, read_mesh, write_meshes
 from p2gs.export.protocol import SurfaceOptions, largest_clusters, surface_options
 from p2gs.export.run_folder import write_twin
 from p2gs.export.sightings import sight
-from p2gs.export.tsdf import Mesh
 from p2gs.export.views import scene_cameras
+from p2gs.ops.mesh import Mesh
 from p2gs.types import UserError
 
 

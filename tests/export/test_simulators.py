@@ -19,7 +19,8 @@ from p2gs.export.glb import glb_bytes
 from p2gs.export.inertia import inertia_of
 from p2gs.export.run_folder import write_twin
 from p2gs.export.simplify import cluster, simplify
-from p2gs.export.tsdf import Mesh, vertex_normals
+from p2gs.export.tsdf import vertex_normals
+from p2gs.ops.mesh import Mesh
 from p2gs.types import Similarity, UserError
 
 SIM = Similarity(2.0, (0.2, 0.1, -0.3))

@@ -10,8 +10,9 @@ from traced import CRATE as BODY
 from traced import boards, seen
 
 from p2gs.export.trays import DEPTH, clear_way, complete_tray, find_front, find_tray, not_the_trays
-from p2gs.export.tsdf import Mesh, fuse
+from p2gs.export.tsdf import fuse
 from p2gs.export.unseen import eyes_of
+from p2gs.ops.mesh import Mesh
 
 VOXEL = 0.02
 TRAVEL = 0.35

@@ -10,8 +10,9 @@ from toy import ring
 from traced import CRATE, boards, seen
 
 from p2gs.export.plinth import plinth_height
-from p2gs.export.tsdf import Mesh, fuse
+from p2gs.export.tsdf import fuse
 from p2gs.export.unseen import close_unseen_sides, eyes_of, facing, seen_empty
+from p2gs.ops.mesh import Mesh
 
 EYE = torch.eye(4, dtype=torch.float64)
 VOXEL = 0.03

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from p2gs.metrics import chamfer as C
+from p2gs.ops.mesh import Mesh, largest_components
 
 
 def box(size=(1.0, 1.0, 1.0), at=(0.0, 0.0, 0.0)):
@@ -45,7 +46,7 @@ def test_sampling_is_uniform_by_area_and_repeats():
     counts, *_ = np.histogram2d(inside[:, 1], inside[:, 2], bins=4)
     assert counts.std() / counts.mean() < 0.1
     with pytest.raises(ValueError, match="without area"):
-        C.sample_surface(C.PlainMesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), 10)
+        C.sample_surface(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), 10)
 
 
 @pytest.mark.parametrize("size", [(1, 1, 1), (0.4, 0.8, 1.2)])
@@ -57,8 +58,8 @@ def test_a_perfect_mesh_scores_the_sampling_floor(size):
 
 
 def test_a_parallel_sheet_scores_twice_its_squared_distance():
-    sheet = C.PlainMesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
-    moved = C.PlainMesh(sheet.vertices + [0, 0, 0.1], sheet.faces)
+    sheet = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    moved = Mesh(sheet.vertices + [0, 0, 0.1], sheet.faces)
     assert C.mesh_chamfer(sheet, moved) == pytest.approx(20 + C.sampling_floor(1.0), rel=0.01)
 
 
@@ -68,25 +69,25 @@ def test_small_components_are_dropped():
     large = trimesh.creation.icosphere(3)
     crumb = trimesh.creation.icosphere(0)
     crumb.apply_translation([5, 0, 0])
-    kept = C.largest_components(C.join([large, crumb]))
+    kept = largest_components(C.join([large, crumb]))
     assert len(kept.faces) == len(large.faces)
-    assert len(C.largest_components(C.join([large, crumb]), fraction=0.01).faces) == len(large.faces) + len(crumb.faces)
-    unwelded = C.PlainMesh(C.triangles(large).reshape(-1, 3), np.arange(3 * len(large.faces)).reshape(-1, 3))
-    assert len(C.largest_components(unwelded).faces) == len(large.faces)
-    assert len(C.largest_components(C.PlainMesh(np.zeros((0, 3)), np.zeros((0, 3), int))).faces) == 0
+    assert len(largest_components(C.join([large, crumb]), fraction=0.01).faces) == len(large.faces) + len(crumb.faces)
+    unwelded = Mesh(C.triangles(large).reshape(-1, 3), np.arange(3 * len(large.faces)).reshape(-1, 3))
+    assert len(largest_components(unwelded, weld=True).faces) == len(large.faces)
+    assert len(largest_components(Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))).faces) == 0
 
 
 def states(static, movable):
     return {
         "start": C.PartMeshes(static, movable),
-        "end": C.PartMeshes(static, [C.PlainMesh(m.vertices + [0, 0, 1.0], m.faces) for m in movable]),
+        "end": C.PartMeshes(static, [Mesh(m.vertices + [0, 0, 1.0], m.faces) for m in movable]),
     }
 
 
 def test_an_object_is_scored_by_part_and_state():
     base, left, right = box((2, 2, 2)), box((0.5, 1, 1), (3, 0, 0)), box((0.5, 1, 1), (-3, 0, 0))
     gt = states(base, [left, right])
-    off = C.PlainMesh(left.vertices + [0.2, 0, 0], left.faces)
+    off = Mesh(left.vertices + [0.2, 0, 0], left.faces)
     pred = states(base, [right, off, box(at=(9, 9, 9))])
     assignment = C.match_parts(pred, gt)
     assert assignment == {0: 1, 1: 0}
@@ -105,7 +106,7 @@ def test_a_part_of_few_triangles_is_part_of_the_whole_and_crumbs_are_not():
     base, door = box((2, 2, 2)).subdivide().subdivide(), box((0.5, 1, 1), (3, 0, 0))
     assert len(door.faces) < 0.1 * len(base.faces)
     crumb = box((0.1, 0.1, 0.1), (5, 0, 0))
-    crumbs = C.PlainMesh(np.concatenate([base.vertices, crumb.vertices]), np.concatenate([base.faces, crumb.faces + len(base.vertices)]))
+    crumbs = Mesh(np.concatenate([base.vertices, crumb.vertices]), np.concatenate([base.faces, crumb.faces + len(base.vertices)]))
     gt, pred = states(base, [door]), states(crumbs, [door])
     report = C.evaluate_chamfer(pred, gt, {0: 0}, seeds=(0,))
     assert report.whole == pytest.approx(report.floors["whole"], rel=0.1)
@@ -118,7 +119,7 @@ def test_missing_parts_fail_and_are_counted():
     report = C.evaluate_chamfer(pred, gt, {}, count=500, seeds=(0,))
     assert (report.movable, report.parts, report.failures) == (None, [None], 1)
     assert C.match_parts(pred, gt) == {}
-    empty = C.PlainMesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+    empty = Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))
     one_state = {"start": C.PartMeshes(base, [door]), "end": C.PartMeshes(base, [empty], whole=base)}
     assert C.evaluate_chamfer(one_state, gt, {0: 0}, count=500, seeds=(0,)).failures == 1
     assert set(report.to_dict()["static"]) == {"value", "floor"}

@@ -92,8 +92,8 @@ def test_export_writes_the_extended_limits_and_leaves_the_twin(tmp_path):
     from p2gs.cli import main
     from p2gs.export.mesh import write_mesh
     from p2gs.export.splat_ply import write_splat_ply
-    from p2gs.export.tsdf import Mesh
     from p2gs.export.twin_json import write_twin_json
+    from p2gs.ops.mesh import Mesh
 
     joint = joint_prismatic((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), 0.2)
     twin = cabinet(joint, box((-0.3, -0.45, -0.2), (0.3, 0.3, 0.2), GREY, skip=("+z",)), [], 0.1)
