@@ -155,6 +155,7 @@ class RegistrationStage(Stage):
     needs = ("states",)
     gives = "states"
     num_parts_matters = False
+    changes_scene = True
 
     @classmethod
     def compute(cls, run: RunContext, section, *, states: list[StateGaussians]) -> Registration:

@@ -166,6 +166,7 @@ class SingleStatePhase(StatePhase):
     gives = "states"
     each_state = True
     num_parts_matters = False
+    changes_scene = True
 
     @classmethod
     def build(cls, run: RunContext, section, *, state: int) -> "SingleStatePhase":

@@ -25,6 +25,7 @@ class Stage:
     Config: dataclass of its options.  needs: names that earlier phases must have handed over.  uses: names given as
     None where no phase hands them over.  gives: name of its own result.  each_state: it runs once for the start and
     once for the end, and its result is the list of both.  num_parts_matters: whether ``num_parts`` decides its result.
+    changes_scene: whether ``hand_on`` gives the run another scene, on which all phases after it then build.
     """
 
     Config: type
@@ -35,6 +36,7 @@ class Stage:
     gives: ClassVar[str] = ""
     each_state: ClassVar[bool] = False
     num_parts_matters: ClassVar[bool] = True
+    changes_scene: ClassVar[bool] = False
 
     @classmethod
     def build(cls, run: RunContext, section: Any, **given: Any) -> Any:

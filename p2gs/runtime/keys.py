@@ -33,7 +33,7 @@ class StageKeys:
         return hashlib.sha256(json.dumps(self.parts(name), sort_keys=True, default=str).encode()).hexdigest()[:16]
 
     def parts(self, name: str) -> Parts:
-        """All that decides the result of phase ``name``: its own and what decides the phases before it."""
+        """All that decides the result of phase ``name``: its own and what decides the phases it builds on."""
         if name not in self._parts:
             run, cfg = self.run, self.run.cfg
             parts = {option: cfg.section(option) for option in ("seed", "rasterizer")} | {"device": run.device.type}
@@ -41,10 +41,8 @@ class StageKeys:
             modules = {type(cfg.data).__module__, rasterizer_module(run.rasterizer)}
             modules |= callback_modules(cfg.trainer)
             parts |= flat("trainer", decides_result(cfg.trainer)) if decides_result(cfg.trainer) else {}
-            for stage in list(self.order)[: list(self.order).index(name) + 1]:
+            for stage in self.deciding(name):
                 phase = self.order[stage]
-                if not phase.wanted(run):
-                    continue
                 parts |= flat(f"phases.{stage}", cfg.section(stage))
                 if phase.num_parts_matters:
                     parts[f"num_parts of {stage}"] = phase.num_parts_key(run)
@@ -52,6 +50,20 @@ class StageKeys:
             parts |= {f"code of {module}": digest for module, digest in self.code.code_of(sorted(modules)).items()}
             self._parts[name] = parts
         return self._parts[name]
+
+    def deciding(self, name: str) -> list[str]:
+        """The phase and those before it that it builds on, directly or not, in their order: they hand over what it needs
+        or uses, or change the scene."""
+        wanted = [stage for stage, phase in self.order.items() if phase.wanted(self.run)]
+        before = wanted[: wanted.index(name)] if name in wanted else wanted
+        phase, found = self.order[name], {name}
+        for what in (*phase.needs, *phase.uses):
+            givers = [stage for stage in before if self.order[stage].gives == what]
+            found |= set(self.deciding(givers[-1])) if givers else set()
+        for stage in before:
+            if self.order[stage].changes_scene:
+                found |= set(self.deciding(stage))
+        return [stage for stage in self.order if stage in found]
 
     def modules(self, name: str) -> set[str]:
         """The modules of a phase, of what it hands over, and of its losses and callbacks that change the result."""

@@ -115,7 +115,9 @@ def test_options_and_code_of_a_stage_and_of_those_before_it(pipeline, monkeypatc
 
     assert differ(keys()) == []
     assert differ(keys("--phases.sharpen.steps", "7")) == ["sharpen", "canonical_fusion", "articulation", "finish"]
-    assert differ(keys("--num_parts", "3")) == ["discovery", "sharpen", "canonical_fusion", "articulation", "finish"]
+    assert differ(keys("--num_parts", "3")) == ["discovery", "canonical_fusion", "articulation", "finish"]
+    assert differ(keys("--phases.discovery.rounds", "1")) == ["discovery", "canonical_fusion", "articulation", "finish"]
+    assert differ(keys("--phases.registration.reach", "0.1"))[:3] == ["registration", "discovery", "sharpen"]
     assert differ(keys("--callbacks.previews.every", "7")) == []
     real = CodeReader.code_of
     edited = partial(changed_code, real, "p2gs.models.finish")
