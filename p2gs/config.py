@@ -11,14 +11,14 @@ import dataclasses
 import importlib
 import os
 import pkgutil
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Iterable, Literal, Optional, Union
+from typing import TYPE_CHECKING, Any, Iterable, Optional
 
 from p2gs.class_path import plain_sections, with_class_paths
 from p2gs.config_files import Layer, overrides_layer, parse_overrides, provenance, read_config, to_yaml
-from p2gs.registry import load_plugins, suggest
-from p2gs.schema import Leaf, Plain, Section, build, check_keys, complete, merge, plain, section_of, switches
+from p2gs.registry import load_plugins
+from p2gs.run_schema import Options, dataset_names, run_schema
+from p2gs.schema import Plain, Section, build, check_keys, complete, merge, plain
 from p2gs.trainer_options import check_trainer_options
 from p2gs.types import UserError, short
 
@@ -27,46 +27,6 @@ if TYPE_CHECKING:
 
     from p2gs.callbacks.base import Callback
     from p2gs.losses.base import Loss
-
-
-STAGES = ("single_state", "registration", "discovery", "sharpen", "canonical_fusion", "articulation", "finish")
-
-
-@dataclass
-class Options:
-    """Top-level options of a run.
-
-    seed: every random choice is a function of it.  run: result folder, default runs/<scene>.  device: auto takes CUDA where
-    there is one.  threads: of the CPU kernels, and of torch outside training steps, default all cores.  rasterizer: a registered backend
-    or auto.  num_parts: including the static base; auto finds out, and a number is the most that discovery may find.
-    exact_parts: num_parts is the number of slots instead: of more parts found the alike become one, fewer get spare slots beside them.
-    plugins: modules that register losses, callbacks, phases, ...
-    stages: phases in the order in which they run, each of which ``phases`` has to mention.
-    strict_paths: files of the scene that lead out of its folder are refused; they are only named else.
-    """
-
-    seed: int = 0
-    run: Optional[str] = None
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    threads: Optional[int] = None
-    rasterizer: str = "auto"
-    num_parts: Union[int, Literal["auto"]] = "auto"
-    exact_parts: bool = False
-    plugins: list[str] = field(default_factory=list)
-    stages: list[str] = field(default_factory=lambda: list(STAGES))
-    strict_paths: bool = False
-
-    def __post_init__(self):
-        if self.run is not None and "\0" in self.run:
-            raise UserError(f"run: expected a folder, got {short(self.run)}")
-        if not 0 <= self.seed < 2**32:
-            raise UserError(f"seed: expected a whole number from 0 to {2**32 - 1}, got {short(self.seed)}")
-        if self.num_parts != "auto" and self.num_parts < 2:
-            raise UserError(f"num_parts: expected at least 2 (it counts the static base), got {self.num_parts}")
-        if self.exact_parts and self.num_parts == "auto":
-            raise UserError("exact_parts: true needs a number of parts (--num_parts N)")
-        if self.threads is not None and self.threads < 1:
-            raise UserError(f"threads: expected at least 1, got {self.threads}")
 
 
 class PhaseSection:
@@ -252,57 +212,6 @@ def _format_found(root: Path) -> str:
 
 def _mentioned(values: Plain, tree: Plain) -> Plain:
     return {k: _mentioned(values[k], v) if isinstance(v, dict) and isinstance(values[k], dict) else values[k] for k, v in tree.items()}
-
-
-def run_schema(data_format: Optional[str]) -> Section:
-    """All keys a config may have, given the data format and what is registered by now.
-
-    A phase whose class says ``trained = False`` has neither losses nor callbacks.
-    """
-    from p2gs.callbacks.base import CALLBACKS
-    from p2gs.losses.base import LOSSES
-    from p2gs.models.phase import PHASES
-
-    losses, callbacks = switches(LOSSES.items()), switches(CALLBACKS.items())
-    root = section_of(Options)
-    root.children["trainer"] = Leaf(Optional[dict], {})
-    root.children["p2gs"] = Leaf(dict, {})  # what save_config notes; read over
-    root.children["data"] = section_of(_dataset(data_format)) if data_format else _any_data()
-    root.children["data"].children = {"format": Leaf(Optional[str], None), **root.children["data"].children}
-    phases = root.children["phases"] = Section(dict)
-    for name, cls in PHASES.items():
-        phase = phases.children[name] = section_of(cls.Config)
-        phase.optional, phase.on = True, False
-        if not getattr(cls, "trained", True):
-            continue
-        for key, section in (("losses", losses), ("callbacks", callbacks)):
-            if key in phase.children:
-                raise TypeError(f"{cls.__qualname__}.Config: '{key}' is a section of every phase and cannot be a field")
-            phase.children[key] = section
-    root.children["callbacks"] = callbacks
-    return root
-
-
-def _dataset(name: str):
-    from p2gs.data.base import DATASETS
-
-    if name not in DATASETS:
-        raise UserError(f"data.format: there is no '{name}'{suggest(str(name), dataset_names())}")
-    return DATASETS[name]
-
-
-def _any_data() -> Section:
-    """What a preset may say of data before a format is known: the options that every source of photographs has."""
-    from p2gs.data.base import TwoStateData
-
-    common = section_of(TwoStateData)
-    return Section(dict, {name: child for name, child in common.children.items() if name != "root"})
-
-
-def dataset_names() -> list[str]:
-    from p2gs.data.base import DATASETS
-
-    return list(DATASETS)
 
 
 def import_builtins() -> None:

@@ -19,7 +19,7 @@ ORDER = [
     ("losses", "metrics", "data"),
     ("models",),
     ("export", "callbacks"),
-    ("config", "class_path", "trainer_options"),
+    ("config", "run_schema", "class_path", "trainer_options"),
     ("runtime",),
     ("pipeline", "side_stage", "side_worker", "bench"),
     ("app", "commands"),

@@ -83,6 +83,18 @@ def test_a_wrong_option_of_a_run_is_told_before_anything_runs(bench_file):
         bench.check_settings()
 
 
+def test_a_format_of_ones_own_takes_the_folders_right_below_the_root(bench_file, tmp_path):
+    for name in ("b", "a", ".hidden"):
+        (tmp_path / "own" / name).mkdir(parents=True)
+    (tmp_path / "own" / "notes.txt").touch()
+    words = ["--root", str(tmp_path / "own"), "--format", "mine", "--seeds", "[0]"]
+    cells = read_bench([bench_file("settings: {full: {}}")], words, objects=["b", "a"]).cells
+    assert [c.object for c in cells] == ["b", "a"] and cells[0].parts is None
+    assert f"--data.root {tmp_path / 'own' / 'b'} --data.format mine" in " ".join(cells[0].words)
+    with pytest.raises(UserError, match="no folder 'c'"):
+        read_bench([bench_file("settings: {full: {}}")], words, objects=["c"])
+
+
 def test_objects_and_settings_can_be_chosen(bench_file):
     bench = read_bench([bench_file()], [], ["laptop"], ["no_repel"])
     assert {(c.object, c.setting) for c in bench.cells} == {("laptop", "no_repel")} and bench.cells[0].donors == ()
