@@ -78,6 +78,8 @@ def tune(
         render = render_gaussians(posed, camera, background, depth_sq=depth_sq, backend=backend)
         inputs = LossInputs(step, config.steps, g, render, target, camera, cache=cache)
         values = [value for value in (loss(inputs) for loss in losses.values()) if value is not None]
+        if not values:  # none is due in this step
+            return
         optimizer.zero_grad(set_to_none=True)
         sum(values).backward()
         optimizer.step()

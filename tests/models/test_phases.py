@@ -75,6 +75,20 @@ def fit(phase, folder, until=None, resume=None, densify=True):
     return phase
 
 
+def test_only_what_losses_ask_for_is_made(scene, views):
+    def made(*chosen):
+        return build("articulation", scene, views, chosen).inputs(0)
+
+    plain = made("render", "flat")
+    assert plain.parts is None and plain.render.depth_sq is None
+    some = made("render", "part", "depth_variance")
+    assert some.parts is not None and some.parts.target_rotation is None and some.render.depth_sq is not None
+    assert made("render", "art").parts.target_rotation is not None
+    seldom = build("articulation", scene, views, ("render", "part"))
+    seldom.losses["part"].start = 0.5
+    assert seldom.inputs(0).parts is None
+
+
 @pytest.mark.parametrize("name", ["single_state", "articulation"])
 def test_same_bits_for_any_number_of_threads(name, scene, views, tmp_path):
     trained = []

@@ -1,10 +1,12 @@
 """The last fit of the Gaussians: colours and surfaces follow the photographs, labels and motions stay."""
 
+from dataclasses import dataclass
+
 import torch
 from test_finish import two_states
 from tiny import hinge
 
-from p2gs.losses.base import LOSSES
+from p2gs.losses.base import LOSSES, Loss
 from p2gs.models.canonical import carry, with_static
 from p2gs.models.screw_polish import photometric_cost
 from p2gs.models.tune import TuneConfig, tune
@@ -42,6 +44,18 @@ def test_under_a_wrong_motion_the_photographs_disagree():
     still = tune(g, labels, torch.eye(4).double()[None], 0.0, views, losses, LEVEL, seed=3)
     right = tune(g, labels, hinge()[None], 0.0, views, losses, LEVEL, seed=3)
     assert cost(right, labels, views, 0) < cost(still, labels, views, 0)
+
+
+def test_a_picture_loss_of_ones_own_counts_and_need_not_be_due_in_every_step():
+    class Squared(Loss):
+        needs, kind = set(), "image"
+
+        def compute(self, inputs):
+            return (inputs.render.colour - inputs.target.image).square().mean()
+
+    g, labels, views = faded()
+    tuned = tune(g, labels, hinge()[None], 0.0, views, {"mine": dataclass(Squared)(every=2)}, LEVEL, seed=3)
+    assert cost(tuned, labels, views, 0) < 0.9 * cost(g, labels, views, 0)
 
 
 def test_off_and_without_a_picture_loss_nothing_changes():
