@@ -13,9 +13,10 @@ from test_clearance import cabinet
 from test_engines import with_looks
 
 from p2gs.app import run as p2gs
-from p2gs.export.asset import HOLD, LIFT, QUICK, Asset, open_note
+from p2gs.export.asset import Asset, open_note
 from p2gs.export.formats import export_profile
 from p2gs.export.inertia import GRAVITY, enclosed, inertia_of
+from p2gs.export.links import HOLD, LIFT, QUICK
 from p2gs.export.metadata import read_meta
 from p2gs.export.mjcf import write_mjcf
 from p2gs.export.simready import file_name
