@@ -95,6 +95,37 @@ def energy(found: Discovery, motions: PartMotions, loss: float) -> float:
 
 
 @dataclass
+class Judge:
+    """By what explanations are compared and refined.  found: discovery's problem.  stacks: rendered depth of both states."""
+
+    found: Discovery
+    states: list
+    views: dict
+    config: PolishConfig
+    stacks: list[DepthStack]
+    seed: int
+    backend: str
+    device: torch.device | str = "cpu"
+
+    def __call__(self, motions: PartMotions) -> tuple[float, float]:
+        """Energy and image loss."""
+        options = {"backend": self.backend, "device": self.device}
+        cost = explanation_cost(self.states, motions, self.views, self.config, self.stacks, **options)
+        return energy(self.found, motions, cost), cost
+
+    def refine(self, motions: PartMotions) -> PartMotions:
+        """Refined by the photographs, whether or not the energy falls."""
+        options = {"seed": self.seed, "backend": self.backend, "device": self.device}
+        return refine(self.states, motions, self.views, self.config, self.stacks, **options)
+
+    def improved(self, motions: PartMotions) -> tuple[float, float, PartMotions]:
+        """Energy, image loss and motions: refined where that lowers the energy, else as they were. Where a part is plain, photographs
+        alone let it drift along itself, and surfaces know better."""
+        tried = self.refine(motions)
+        return min(((*self(m), m) for m in (motions, tried)), key=lambda t: t[0])
+
+
+@dataclass
 class Seen:
     """Of a state: which Gaussians [N] nothing contradicts in the other state; the weight of its photographs' pixels (None: all count alike)."""
 
