@@ -35,6 +35,8 @@ class PartMotionsConfig:
     freedom_penalty: relative image loss by which a turn must win against a slide.
     same_motion: two touching parts whose motions carry them this near to each other (internal units) are tried as one.
     survey: shifts within its own surface tried for each part (internal units; [] = none).
+    part_penalty: share of the image loss that a part must save which is added or halved when parts are reconsidered: junk that surfaces gain
+    by saves half of this, the second of two stacked doors three times.
     islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
     (0 = off).  rounds: how often labels, types and motions are settled anew.
     reconsider: each part's motion, one more, and each part as two are searched again amid the others, refined, and taken where the
@@ -49,6 +51,7 @@ class PartMotionsConfig:
     compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
     same_motion: float = 0.04
+    part_penalty: float = 0.01
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     islands: float = 0.25
     rounds: int = 2
@@ -105,7 +108,7 @@ def find_part_motions(
         looks = [first_look(e) for e in explanations]
         order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
         explanations = [explanations[i] for i in order]
-    judge, refined, tried = Judge(found, states, views, config.coarse, stacks, **options), [], []
+    judge, refined, tried = Judge(found, states, views, config.coarse, stacks, further=config.part_penalty, **options), [], []
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
@@ -122,14 +125,14 @@ def find_part_motions(
     if bodies:
         motions = judge.improved(motions)[2]
     changed: list[dict] = [{"change": "one part a body", **b} for b in bodies]
-    motions, shifted = leave_false_minima(states, motions, views, config.coarse, stacks, config.survey, **options)
+    motions, shifted = leave_false_minima(judge, motions, config.survey)
     if config.reconsider:
         say("reconsidering each part")
         motions, reconsidered = reconsider(judge, motions, limit)
         changed += reconsidered
         motions = simplify(judge, motions, config.same_motion, changed)
     say("settling labels and motions")
-    motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
+    motions, rounds = settle_labels(judge, motions, config)
     motions, joined = join_twins(states, motions, found.problem.scale.tp)
     if joined:
         motions = refine(states, motions, views, config.coarse, stacks, **options)

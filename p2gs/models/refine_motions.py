@@ -96,7 +96,8 @@ def energy(found: Discovery, motions: PartMotions, loss: float) -> float:
 
 @dataclass
 class Judge:
-    """By what explanations are compared and refined.  found: discovery's problem.  stacks: rendered depth of both states."""
+    """By what explanations are compared and refined.  found: discovery's problem.  stacks: rendered depth of both states.  further: share of
+    the image loss that a further part must save."""
 
     found: Discovery
     states: list
@@ -106,6 +107,7 @@ class Judge:
     seed: int
     backend: str
     device: torch.device | str = "cpu"
+    further: float = 0.0
 
     def __call__(self, motions: PartMotions) -> tuple[float, float]:
         """Energy and image loss."""
@@ -187,27 +189,16 @@ def survey(
     return motions, moved
 
 
-def leave_false_minima(
-    states,
-    motions: PartMotions,
-    views,
-    config: PolishConfig,
-    stacks: list[DepthStack],
-    reach: list[float],
-    *,
-    seed: int,
-    backend: str,
-    device="cpu",
-) -> tuple[PartMotions, list[int]]:
-    """Refined motions once more from where ``survey`` lays the parts, kept if that explains the images better.
+def leave_false_minima(judge: Judge, motions: PartMotions, reach: list[float]) -> tuple[PartMotions, list[int]]:
+    """Refined motions once more from where ``survey`` lays the parts, kept if the energy falls.
 
     Returns them and which parts moved.
     """
-    if config.steps <= 0 or not reach or len(motions) == 0:
+    if judge.config.steps <= 0 or not reach or len(motions) == 0:
         return motions, []
-    surveyed, moved = survey(states, motions, views, config, stacks, reach, backend=backend, device=device)
+    options = {"backend": judge.backend, "device": judge.device}
+    surveyed, moved = survey(judge.states, motions, judge.views, judge.config, judge.stacks, reach, **options)
     if not moved:
         return motions, []
-    surveyed = refine(states, surveyed, views, config, stacks, seed=seed, backend=backend, device=device)
-    before, after = (explanation_cost(states, m, views, config, stacks, backend=backend, device=device) for m in (motions, surveyed))
-    return (surveyed, moved) if after < before else (motions, [])
+    value, _, surveyed = judge.improved(surveyed)
+    return (surveyed, moved) if value < judge(motions)[0] else (motions, [])

@@ -12,13 +12,12 @@ from p2gs.models.discovery import Candidate, Discovery, in_two, instead_of, rela
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.islands import settle_islands
 from p2gs.models.part_choices import settle_types, without_part
-from p2gs.models.refine_motions import Judge, explanation_cost, refine
+from p2gs.models.refine_motions import Judge, refine
 from p2gs.ops.sh import dc_to_rgb
 
 if TYPE_CHECKING:
     from p2gs.models.part_motions import PartMotionsConfig
 
-SETTLED = 0.005  # a round of settling that lowers the image loss by less is the last
 
 
 def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
@@ -36,7 +35,8 @@ def reconsider(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMoti
 
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), and for each part the two amounts about one
     axis that explain most (``in_two``); under each proposal every surfel chooses its part anew and the states are re-rendered. The best of
-    each kind is refined; the energy must fall, and with a further part the image loss as well: where surfaces alone gain, it is junk.
+    each kind is refined, and the energy must fall; with a further part the image loss must as well (``judge.further``): what surfaces alone
+    gain is junk.
     Returns the motions and what was tried.
     """
     found, states, log = judge.found, judge.states, []
@@ -55,7 +55,7 @@ def reconsider(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMoti
             value, reached, refined = judge.improved(tried)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
             log[-1] |= {"proposed": min(values) - lowest, "energy": value - lowest}
-            junk = len(refined) > len(motions) and reached >= cost
+            junk = len(refined) > len(motions) and reached > cost * (1 - judge.further)
             if value < (lowest if best is None else best[0]) and not junk:
                 best = (value, reached, refined)
         if best is None:
@@ -88,33 +88,27 @@ def _relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:
     return replace(motions, labels=labels, margin=margin, confidence=torch.tensor([m.confidence for m in explanation.motions]))
 
 
-def settle_labels(
-    found: Discovery, states, motions: PartMotions, views, config: PartMotionsConfig, stacks, *, seed: int, backend: str, device="cpu"
-) -> tuple[PartMotions, list[dict]]:
+def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:
     """With the refined motions every Gaussian chooses its part anew, islands are settled, motions refined again and types settled.
 
-    For ``rounds`` rounds, while the images are explained better. Returns the motions and what each round measured.
+    For up to ``rounds`` rounds, while the energy falls. Returns the motions and what each round measured.
     """
-    options = {"seed": seed, "backend": backend, "device": device}
-    rounds: list[dict] = []
-    cost = explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device)
+    found, states, rounds = judge.found, judge.states, []
+    options = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
     for number in range(config.rounds if len(motions) else 0):
+        lowest, cost = judge(motions)
         best = None
         # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from here on
         for name in ("kept", "anew"):
             tried = _relabelled(found, states, motions) if name == "anew" else motions
             labels, count = settle_islands([s.gaussians for s in states], tried.labels, tried.transforms, config.islands)
-            tried = refine(states, replace(tried, labels=labels), views, config.coarse, stacks, **options)
-            reached = explanation_cost(states, tried, views, config.coarse, stacks, backend=backend, device=device)
-            rounds.append({"round": number, "labels": name, "islands": count, "before": cost, "after": reached})
-            if best is None or reached < best[0]:
-                best = (reached, tried)
-        if best[0] >= cost:
+            value, reached, tried = judge.improved(replace(tried, labels=labels))
+            rounds.append({"round": number, "labels": name, "islands": count, "before": cost, "after": reached, "energy": value - lowest})
+            if best is None or value < best[0]:
+                best = (value, tried)
+        if best[0] >= lowest:
             break
-        motions = settle_types(states, best[1], views, config, stacks, **options)
-        if best[0] > cost * (1 - SETTLED):
-            break
-        cost = explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device)
+        motions = settle_types(states, best[1], judge.views, config, judge.stacks, **options)
     return motions, rounds
 
 

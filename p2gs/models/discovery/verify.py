@@ -19,18 +19,21 @@ STILL = 0.3  # weight of a point that is said to move but is not known to: its e
 def violation(problem: Problem, motions: Motions, labelling: Labelling, state: int, index: Tensor, views: int = 32) -> Tensor:
     """Cost [M] in 0..1 of the labelled surfels ``index`` [M] of ``state``: the share of the other state's views that see through where a
     point is predicted, of those not blocked by something in front; where they see a surface that is of another part or another colour, as
-    wrong as empty space; ``Landing.HIDDEN`` where all are blocked. A moved point that is called static is wrong."""
+    wrong as empty space (of a plate's other side, ``motions.thick`` away, colours tell nothing); ``Landing.HIDDEN`` where all are blocked.
+    A moved point that is called static is wrong."""
     surf, stack, other = problem.surfels[state], problem.stacks[1 - state], problem.surfels[1 - state]
     labels = labelling.labels(state)[index]
-    x = surf.points[index].clone()
+    x, n, thick = surf.points[index].clone(), surf.normals[index].clone(), torch.zeros(len(index))
     for k in range(len(motions)):
-        mine = labels == k + 1
-        x[mine] = motions[k : k + 1].apply(x[mine], inverse=state == 1)[0]
+        mine, motion = labels == k + 1, motions[k : k + 1]
+        x[mine], n[mine] = motion.apply(x[mine], inverse=state == 1)[0], motion.rotate(n[mine], inverse=state == 1)[0]
+        thick[mine] = motion.thick
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(views))
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
     d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
-    like = (labelling.labels(1 - state)[j] == labels[:, None]) & (d < 2 * problem.scale.spacing + problem.scale.tp)
-    like &= (other.colours[j] - surf.colours[index][:, None]).abs().mean(2) < problem.config.recoloured
+    like = (labelling.labels(1 - state)[j] == labels[:, None]) & (d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None])
+    other_side = ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
+    like &= other_side | ((other.colours[j] - surf.colours[index][:, None]).abs().mean(2) < problem.config.recoloured)
     through = free / (free + on).clamp_min(1)
     shown = through + (1 - through) * torch.where(like.any(1), 0.0, WRONG)
     cost = torch.where(free + on > 0, shown, torch.full_like(free, Landing.HIDDEN))
