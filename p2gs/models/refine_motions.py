@@ -88,18 +88,20 @@ def explanation_cost(
     return 0.5 * total
 
 
-def energy(found: Discovery, motions: PartMotions, loss: float) -> float:
+def energy(found: Discovery | None, motions: PartMotions, loss: float) -> float:
     """One number by which explanations are compared, lower is better: the logarithm of the image loss (``explanation_cost``) plus what the
-    surfaces say (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained."""
-    return math.log(max(loss, 1e-9)) + surface_energy(found, motions.transforms, motions.types)
+    surfaces say (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained.
+    Without ``found`` photographs alone speak."""
+    surfaces = 0.0 if found is None else surface_energy(found, motions.transforms, motions.types)
+    return math.log(max(loss, 1e-9)) + surfaces
 
 
 @dataclass
 class Judge:
-    """By what explanations are compared and refined.  found: discovery's problem.  stacks: rendered depth of both states.  further: share of
+    """By what explanations are compared and refined.  found: discovery's problem (None: photographs alone).  stacks: rendered depth of both states.  further: share of
     the image loss that a further part must save."""
 
-    found: Discovery
+    found: Discovery | None
     states: list
     views: dict
     config: PolishConfig
