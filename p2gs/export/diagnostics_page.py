@@ -131,15 +131,17 @@ def _discovery(d: dict) -> list[str]:
         out.append(table(["state", "moved", "static", "unknown", "moved, but in no part"], rows))
     found = d["discovery"]
     if found is not None:
-        rows, contests = [], found.get("contests", [])
+        rows = []
         for i, e in enumerate(found["explanations"]):
             tried = e.get("reductions", [])
             gone = ", ".join(f"{r['change']} {r['type']} ({r['cost_with']:.4f} to {r['cost_without']:.4f})" for r in tried)
-            ended = [c for c in contests if c["explanation"] == i and len(contests) > 1]
-            mark = "chosen" if i == found["chosen"] else "reconsidered" if ended else ""
+            mark = "chosen" if i == found["chosen"] else ""
             rows.append([str(i + 1), f"{e['cost']:.4f}", f"{e['rank']:.3f}", mark, f"{', '.join(e.get('types', []))}{'; ' * bool(gone)}{gone}"])
-            rows += [["", "", f"{c['rank']:.3f}", "where that led", ", ".join(c["types"])] for c in ended]
         out.append(table(["explanation", "image loss", "energy", "", "parts; what was dropped or merged (image loss with it, without it)"], rows))
+        tried = [t for t in found.get("reconsidered", []) if "energy" in t and "after" in t]
+        if tried:
+            rows = [[t["change"], t["type"], f"{t['cost']:.4f}", f"{t['after']:.4f}", f"{t['energy']:+.4f}"] for t in tried]
+            out.append(table(["tried on the chosen one", "type", "image loss", "with it", "energy"], rows))
         rows = [[f"{p['part']}", p["type"], _amount(p), f"{p['confidence']:.2f}"] for p in found["parts"]]
         out.append(table(["part of discovery", "type", "start to end", "share explained"], rows))
     rows = [

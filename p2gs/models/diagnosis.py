@@ -162,13 +162,13 @@ def evidence_points(motions: PartMotions, state: StateGaussians) -> tuple[Tensor
 
 
 def discovery(motions: PartMotions, unit: float) -> dict:
-    """Explanations that were compared, with their image losses; parts that were dropped or merged, with the reason; what became of those
-    that were reconsidered (``contests``: the parts and the loss, with its price on parts, that each ended at)."""
+    """Explanations that were compared, with their image losses; parts that were dropped or merged, with the reason; what was tried when the
+    best was reconsidered."""
     told = motions.diagnostics
     return {
         "chosen": told.get("explanation"),
         "explanations": told.get("explanations", []),
-        "contests": told.get("contests", []),
+        "reconsidered": told.get("reconsidered", []),
         "candidates": told.get("candidates", []),
         "parts": [
             {"part": k + 1, "type": t, **amount(t, T, unit), "confidence": float(c)}

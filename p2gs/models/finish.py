@@ -16,7 +16,7 @@ from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.islands import settle_twin_islands
 from p2gs.models.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.models.joint_range import extend_ranges
-from p2gs.models.refine_motions import leave_false_minima, refine, single_ways
+from p2gs.models.refine_motions import Judge, leave_false_minima, refine, single_ways
 from p2gs.models.screw_polish import PolishConfig, photometric_cost
 from p2gs.models.tune import TuneConfig, tune
 from p2gs.ops import se3, so3
@@ -197,7 +197,7 @@ def finish(
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         refined = refine(states, motions, views, config.polish, stacks, **options)
-        refined, _ = leave_false_minima(states, refined, views, config.polish, stacks, config.survey, **options)
+        refined, _ = leave_false_minima(Judge(None, states, views, config.polish, stacks, **options), refined, config.survey)
         transforms = refined.transforms
         record.after = transforms
         record.polish = single_ways(states, refined, views, config.polish, stacks, **options)

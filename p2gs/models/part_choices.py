@@ -9,7 +9,7 @@ from torch import Tensor
 
 from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import PartMotions
-from p2gs.models.refine_motions import explanation_cost, refine
+from p2gs.models.refine_motions import Judge, explanation_cost, refine
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 
@@ -17,33 +17,27 @@ if TYPE_CHECKING:
     from p2gs.models.part_motions import PartMotionsConfig
 
 
-def simplify(
-    states, motions: PartMotions, views, config: PartMotionsConfig, stacks: list[DepthStack], *, backend: str, device="cpu",
-    log: list[dict] | None = None,
-) -> PartMotions:  # fmt: skip
-    """Make one of touching parts with one motion, and drop parts without which the images are explained as well.
+def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None) -> PartMotions:
+    """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the energy does not rise.
 
-    log: told of each part that goes: what was done, its type, image loss with and without it, the loss that was allowed.
+    log: told of each part that goes: what was done, its type, image loss with and without it, what the energy gains.
     """
-    cost = explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device)
+    lowest, cost = judge(motions)
     tried: set[tuple] = set()
     while len(motions):
-        found = None
-        for change, reduced in _reductions(states, motions, config.same_motion):
+        for change, reduced in _reductions(judge.states, motions, same_motion):
             if change in tried:
                 continue
             tried.add(change)
-            lower = explanation_cost(states, reduced, views, config.coarse, stacks, backend=backend, device=device)
-            penalty = config.merge_penalty if change[0] == "merge" else config.part_penalty
-            if lower <= cost * (1 + penalty):
-                found = (reduced, lower)
-                if log is not None:
-                    gone = {"change": change[0], "type": motions.types[change[1]], "cost_with": cost, "cost_without": lower}
-                    log.append({**gone, "allowed": cost * (1 + penalty)})
+            value, lower = judge(reduced)
+            if value <= lowest:
                 break
-        if found is None:
+        else:
             return motions
-        motions, cost = found[0], min(cost, found[1])
+        if log is not None:
+            gone = {"change": change[0], "type": motions.types[change[1]], "cost_with": cost, "cost_without": lower}
+            log.append({**gone, "energy": value - lowest})
+        motions, lowest, cost = reduced, value, lower
         tried.clear()
     return motions
 

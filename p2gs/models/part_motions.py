@@ -17,10 +17,9 @@ from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.part_choices import join_twins, settle_types, simplify
 from p2gs.models.phase import PHASES
-from p2gs.models.refine_motions import energy, explanation_cost, leave_false_minima, refine
+from p2gs.models.refine_motions import Judge, energy, explanation_cost, leave_false_minima, refine
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.models.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
-from p2gs.ops import se3
 from p2gs.types import TwoStateScene, UserError
 
 
@@ -30,48 +29,33 @@ class PartMotionsConfig:
 
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
     candidates: how many complete explanations are compared by re-rendering; of more, those that look best after ``look_steps`` of
-    refinement at the smallest size.  contenders: how many of these go on through all that follows, up to ``reconsider``, where they differ
-    and their energy is within ``contend`` of the best: a wrong start may lead nowhere, and a worse one to the truth.
+    refinement at the smallest size.
     coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
-    freedom_penalty: relative image loss by which a turn must win against a slide.  part_penalty: relative image
-    loss that a part must save once its motion is refined.
-    same_motion, merge_penalty: two touching parts whose motions carry them this near to each other (internal units) become one
-    unless the image loss rises by more than this share.
+    freedom_penalty: relative image loss by which a turn must win against a slide.
+    same_motion: two touching parts whose motions carry them this near to each other (internal units) are tried as one.
     survey: shifts within its own surface tried for each part (internal units; [] = none).
+    part_penalty: share of the image loss that a part must save which is added or halved when parts are reconsidered: junk that surfaces gain
+    by saves half of this, the second of two stacked doors three times.
     islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
     (0 = off).  rounds: how often labels, types and motions are settled anew.
-    reconsider: each part's motion, and one more, is searched again amid the others, refined, and taken where the energy falls;
-    missing_confidence, missing_evidence: confidence and evidence that a further part must have.
-    split_reach: a part is tried as two whose motions differ by up to twice this (internal units; 0 = never) where that saves ``split``
-    of its residual; also with a part left out whose evidence is below ``doubtful``. Where it saves ``split_fine``, amounts near each other
-    are tried, too: two parts whose motions hardly differ. Of these both directions must tell their
-    difference alike (``ways_disagree`` below split_ways).
+    reconsider: each part's motion, one more, and each part as two are searched again amid the others, refined, and taken where the
+    energy falls.
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
 
     evidence_size: int = 200
     min_opacity: float = 0.5
     candidates: int = 3
-    contenders: int = 2
-    contend: float = 0.1
     look_steps: int = 40
     compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
-    part_penalty: float = 0.02
     same_motion: float = 0.04
-    merge_penalty: float = 0.012
+    part_penalty: float = 0.01
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     islands: float = 0.25
     rounds: int = 2
     reconsider: bool = True
-    missing_confidence: float = 0.3
-    missing_evidence: float = 0.005
-    split_reach: float = 0.05
-    split: float = 0.12
-    split_fine: float = 0.03
-    split_ways: float = 0.27
-    doubtful: float = 0.1
     min_confidence: float = 0.02
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
@@ -124,39 +108,31 @@ def find_part_motions(
         looks = [first_look(e) for e in explanations]
         order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
         explanations = [explanations[i] for i in order]
-    refined, tried = [], []
+    judge, refined, tried = Judge(found, states, views, config.coarse, stacks, further=config.part_penalty, **options), [], []
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, states)
         if len(explanations) > 1:
             say(f"re-rendering explanation {number + 1} of {len(explanations)}")
-        motions = refine(states, motions, views, config.coarse, stacks, **options)
         reductions: list[dict] = []
-        motions = simplify(states, motions, views, config, stacks, backend=backend, device=device, log=reductions)
-        cost = explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device)
-        rank = energy(found, motions, cost)
+        motions = simplify(judge, judge.improved(motions)[2], config.same_motion, reductions)
+        rank, cost = judge(motions)
         tried.append({"types": motions.types, "cost": cost, "rank": rank, "value": explanation.value, "reductions": reductions})
         refined.append((rank, number, motions))
-    contenders = _contenders(refined, config)
+    rank, number, motions = min(refined, key=lambda t: t[:2])
     limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
-    ends, contests = [], []
-    for _, number, motions in contenders:
-        motions = settle_types(states, motions, views, config, stacks, **options)
-        motions, bodies = one_part_a_body(states, motions, labelled_surfaces(found, motions.transforms, motions.types), limit)
-        if bodies:
-            motions = refine(states, motions, views, config.coarse, stacks, **options)
-        changed: list[dict] = [{"change": "one part a body", **b} for b in bodies]
-        motions, shifted = leave_false_minima(states, motions, views, config.coarse, stacks, config.survey, **options)
-        if config.reconsider:
-            say("reconsidering each part" + (f" of explanation {number + 1}" if len(contenders) > 1 else ""))
-            motions, reconsidered = reconsider(found, states, motions, views, config, stacks, limit, **options)
-            changed += reconsidered
-            motions = simplify(states, motions, views, config, stacks, backend=backend, device=device, log=changed)
-        rank = energy(found, motions, explanation_cost(states, motions, views, config.coarse, stacks, backend=backend, device=device))
-        contests.append({"explanation": number, "types": motions.types, "rank": rank})
-        ends.append((number, motions, shifted, changed))
-    number, motions, shifted, changed = ends[min(range(len(ends)), key=lambda i: contests[i]["rank"])]
+    motions = settle_types(states, motions, views, config, stacks, **options)
+    motions, bodies = one_part_a_body(states, motions, labelled_surfaces(found, motions.transforms, motions.types), limit)
+    if bodies:
+        motions = judge.improved(motions)[2]
+    changed: list[dict] = [{"change": "one part a body", **b} for b in bodies]
+    motions, shifted = leave_false_minima(judge, motions, config.survey)
+    if config.reconsider:
+        say("reconsidering each part")
+        motions, reconsidered = reconsider(judge, motions, limit)
+        changed += reconsidered
+        motions = simplify(judge, motions, config.same_motion, changed)
     say("settling labels and motions")
-    motions, rounds = settle_labels(found, states, motions, views, config, stacks, **options)
+    motions, rounds = settle_labels(judge, motions, config)
     motions, joined = join_twins(states, motions, found.problem.scale.tp)
     if joined:
         motions = refine(states, motions, views, config.coarse, stacks, **options)
@@ -165,7 +141,6 @@ def find_part_motions(
         say(f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})")
     motions.diagnostics = {
         "explanation": number,
-        "contests": contests,
         "first_looks": looks,
         "explanations": tried,
         "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],  # of the Gaussians above min_opacity
@@ -185,25 +160,6 @@ def labelled_surfaces(found: Discovery, transforms: Tensor, types: list[str]) ->
     explanation, problem = relabel(found, transforms, types), found.problem
     points, labels = [s.points for s in problem.surfels], [p.argmax(1) for p in explanation.probability]
     return Surfaces(points, labels, problem.scale.spacing, problem.stacks, problem.scale.tau)
-
-
-def _contenders(refined: list[tuple[float, int, PartMotions]], config: PartMotionsConfig) -> list[tuple[float, int, PartMotions]]:
-    """Of (energy, number, motions), the best first and those that are nearly as good and say something else."""
-    ordered, out = sorted(refined, key=lambda t: t[:2]), []
-    for rank, number, motions in ordered:
-        close = rank <= ordered[0][0] + config.contend
-        if not out or (close and not any(_same(motions, other, config.same_motion) for _, _, other in out)):
-            out.append((rank, number, motions))
-    return out[: max(config.contenders, 1)]
-
-
-def _same(a: PartMotions, b: PartMotions, reach: float) -> bool:
-    """Do both have the same parts: each motion carries the unit box about the origin as one of the other's does, to within ``reach``?"""
-    if len(a) != len(b) or len(a) == 0:
-        return len(a) == len(b)
-    corners = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)
-    apart = (se3.apply(a.transforms, corners)[:, None] - se3.apply(b.transforms, corners)).norm(dim=-1).amax(-1)
-    return bool((apart.amin(1) < reach).all() and (apart.amin(0) < reach).all())
 
 
 def _explanations(found) -> list:

@@ -88,10 +88,45 @@ def explanation_cost(
     return 0.5 * total
 
 
-def energy(found: Discovery, motions: PartMotions, loss: float) -> float:
+def energy(found: Discovery | None, motions: PartMotions, loss: float) -> float:
     """One number by which explanations are compared, lower is better: the logarithm of the image loss (``explanation_cost``) plus what the
-    surfaces say (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained."""
-    return math.log(max(loss, 1e-9)) + surface_energy(found, motions.transforms, motions.types)
+    surfaces say (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained.
+    Without ``found`` photographs alone speak."""
+    surfaces = 0.0 if found is None else surface_energy(found, motions.transforms, motions.types)
+    return math.log(max(loss, 1e-9)) + surfaces
+
+
+@dataclass
+class Judge:
+    """By what explanations are compared and refined.  found: discovery's problem (None: photographs alone).  stacks: rendered depth of both states.  further: share of
+    the image loss that a further part must save."""
+
+    found: Discovery | None
+    states: list
+    views: dict
+    config: PolishConfig
+    stacks: list[DepthStack]
+    seed: int
+    backend: str
+    device: torch.device | str = "cpu"
+    further: float = 0.0
+
+    def __call__(self, motions: PartMotions) -> tuple[float, float]:
+        """Energy and image loss."""
+        options = {"backend": self.backend, "device": self.device}
+        cost = explanation_cost(self.states, motions, self.views, self.config, self.stacks, **options)
+        return energy(self.found, motions, cost), cost
+
+    def refine(self, motions: PartMotions) -> PartMotions:
+        """Refined by the photographs, whether or not the energy falls."""
+        options = {"seed": self.seed, "backend": self.backend, "device": self.device}
+        return refine(self.states, motions, self.views, self.config, self.stacks, **options)
+
+    def improved(self, motions: PartMotions) -> tuple[float, float, PartMotions]:
+        """Energy, image loss and motions: refined where that lowers the energy, else as they were. Where a part is plain, photographs
+        alone let it drift along itself, and surfaces know better."""
+        tried = self.refine(motions)
+        return min(((*self(m), m) for m in (motions, tried)), key=lambda t: t[0])
 
 
 @dataclass
@@ -156,27 +191,16 @@ def survey(
     return motions, moved
 
 
-def leave_false_minima(
-    states,
-    motions: PartMotions,
-    views,
-    config: PolishConfig,
-    stacks: list[DepthStack],
-    reach: list[float],
-    *,
-    seed: int,
-    backend: str,
-    device="cpu",
-) -> tuple[PartMotions, list[int]]:
-    """Refined motions once more from where ``survey`` lays the parts, kept if that explains the images better.
+def leave_false_minima(judge: Judge, motions: PartMotions, reach: list[float]) -> tuple[PartMotions, list[int]]:
+    """Refined motions once more from where ``survey`` lays the parts, kept if the energy falls.
 
     Returns them and which parts moved.
     """
-    if config.steps <= 0 or not reach or len(motions) == 0:
+    if judge.config.steps <= 0 or not reach or len(motions) == 0:
         return motions, []
-    surveyed, moved = survey(states, motions, views, config, stacks, reach, backend=backend, device=device)
+    options = {"backend": judge.backend, "device": judge.device}
+    surveyed, moved = survey(judge.states, motions, judge.views, judge.config, judge.stacks, reach, **options)
     if not moved:
         return motions, []
-    surveyed = refine(states, surveyed, views, config, stacks, seed=seed, backend=backend, device=device)
-    before, after = (explanation_cost(states, m, views, config, stacks, backend=backend, device=device) for m in (motions, surveyed))
-    return (surveyed, moved) if after < before else (motions, [])
+    value, _, surveyed = judge.improved(surveyed)
+    return (surveyed, moved) if value < judge(motions)[0] else (motions, [])

@@ -7,7 +7,8 @@
 
 namespace p2gs {
 
-void depth_counts(const DepthViews& views, const float* points, int64_t size, float* out, int threads) {
+static void in_chunks(decltype(ViewKernels::counts) kernel, const DepthViews& views, const float* points, int64_t size, float* out,
+                      int threads) {
     constexpr int64_t kPoints = 2048;  // of a chunk
     struct Context {
         decltype(ViewKernels::counts) kernel;
@@ -15,7 +16,7 @@ void depth_counts(const DepthViews& views, const float* points, int64_t size, fl
         const float* points;
         int64_t size;
         float* out;
-    } context{kernels().views.counts, views, points, size, out};
+    } context{kernel, views, points, size, out};
     parallel_for(
         int((size + kPoints - 1) / kPoints), threads,
         [](int chunk, int, void* p) {
@@ -24,6 +25,14 @@ void depth_counts(const DepthViews& views, const float* points, int64_t size, fl
             c.kernel(c.views, c.points, c.size, begin, std::min(begin + kPoints, c.size), c.out);
         },
         &context);
+}
+
+void depth_counts(const DepthViews& views, const float* points, int64_t size, float* out, int threads) {
+    in_chunks(kernels().views.counts, views, points, size, out, threads);
+}
+
+void depth_directions(const DepthViews& views, const float* points, int64_t size, float* out, int threads) {
+    in_chunks(kernels().views.directions, views, points, size, out, threads);
 }
 
 }  // namespace p2gs

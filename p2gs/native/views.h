@@ -19,9 +19,12 @@ struct DepthViews {
 struct ViewKernels {
     // Points [begin, end) of `points` [size, 3]: out [3][size] counts of free, on a surface, behind.
     void (*counts)(const DepthViews&, const float* points, int64_t size, int64_t begin, int64_t end, float* out);
+    // out [3][size] sums of the unit directions to the cameras that see each point on a surface.
+    void (*directions)(const DepthViews&, const float* points, int64_t size, int64_t begin, int64_t end, float* out);
 };
 
 // The same bits for any number of threads.
 void depth_counts(const DepthViews& views, const float* points, int64_t size, float* out, int threads);
+void depth_directions(const DepthViews& views, const float* points, int64_t size, float* out, int threads);
 
 }  // namespace p2gs

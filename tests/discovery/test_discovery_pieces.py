@@ -10,16 +10,18 @@ import pytest
 import torch
 from boxes import both, door, drawer, shell
 
+from p2gs.models.discovery.amounts import parted
 from p2gs.models.discovery.config import DiscoveryConfig
 from p2gs.models.discovery.evidence import DepthStack, classify
 from p2gs.models.discovery.finish import Explanation
-from p2gs.models.discovery.labels import REVEALED, Labelling, unary
-from p2gs.models.discovery.pipeline import discover, ranked, relabel
+from p2gs.models.discovery.labels import REVEALED, Graph, Labelling, label, unary
+from p2gs.models.discovery.pipeline import as_motions, discover, ranked, relabel, static_axes, total_score
 from p2gs.models.discovery.problem import build_problem, evidence_masks
 from p2gs.models.discovery.refine import pattern_search
 from p2gs.models.discovery.rigid import Motions
 from p2gs.models.discovery.search import Search
 from p2gs.models.discovery.surfels import Surfels, window_planes
+from p2gs.models.discovery.verify import violation
 
 
 def counts_naive(stack: DepthStack, points, tau):
@@ -92,16 +94,62 @@ def test_seen_through_is_moved_and_covered_is_unknown():
 def test_ranking_is_by_score_without_the_same_motions_again():
     torch.manual_seed(0)
     a, b = random_motions(2), random_motions(3)
-    search = SimpleNamespace(
-        problem=SimpleNamespace(config=DiscoveryConfig(part_cost=0.0, search_weight=1.0)),
-        pool=SimpleNamespace(add=lambda m: torch.arange(len(m)), total=lambda chosen: 0.25 * (len(chosen) == 3)),
-        probe=torch.randn(50, 3), radius=0.05,
-    )  # fmt: skip
+    search = SimpleNamespace(probe=torch.randn(50, 3), radius=0.05)
     search.agree = lambda x, y: Search.agree(search, x, y)
     make = lambda score, m: Explanation(m, Labelling([], []), 0.0, score)  # noqa: E731
-    order = ranked(search, [make(0.3, a), make(0.5, b), make(0.2, a[torch.tensor([1, 0])]), make(0.75, a[:1])])
+    order = ranked(search, [make(0.3, a), make(0.25, b), make(0.2, a[torch.tensor([1, 0])]), make(0.75, a[:1])])
     assert [(e.score, len(e.motions)) for e in order] == [(0.2, 2), (0.25, 3), (0.75, 1)]
-    assert [e.value for e in order] == [0.0, 0.25, 0.0]
+
+
+@pytest.fixture(scope="module")
+def stacked():
+    """Two stacked doors on one hinge, 36 and 30 degrees open: what they are as one motion whose hinge tilts, and the truth."""
+    obj = shell(door(-0.6, 0.6, -0.62, -0.02, True, 36), door(-0.6, 0.6, 0.02, 0.62, True, 30))
+    (start, end), _ = both(obj)
+    problem, _ = build_problem(start, end, DiscoveryConfig(surfels=4000), 0)
+    T = torch.stack([torch.from_numpy(part.pose(1.0) @ np.linalg.inv(part.pose(0.0))) for part in obj.parts[1:]])
+    truth = as_motions(T, ["revolute"] * 2)
+    truth = truth[truth.amount.abs().argsort()]
+    mean = Motions(truth.turn[:1], truth.axis[:1], truth.centre[:1], truth.amount.mean()[None])
+    tilt = 0.05 * torch.linalg.cross(mean.axis, torch.tensor([[0.0, 1.0, 0.0]]))
+    tilted = Motions(mean.turn, torch.nn.functional.normalize(mean.axis + tilt, dim=1), mean.centre, mean.amount)
+    return problem, [Graph(s.points, s.normals, s.colours) for s in problem.surfels], tilted, truth
+
+
+def test_stacked_doors_are_two_amounts_about_one_axis(stacked):
+    problem, graphs, tilted, truth = stacked
+    labelling = label(problem, tilted, graphs)
+    alone = total_score(problem, tilted, labelling)
+    found = parted(problem, graphs, labelling, tilted, 0, static_axes(problem))
+    assert [len(m) for m in found] == [2] * len(found) and len(found) >= 2  # about its own axis, and about the upright
+    scores = [total_score(problem, m, label(problem, m, graphs)) for m in found]
+    best = found[scores.index(min(scores))]
+    assert min(scores) < alone and float((best.axis[0] @ truth.axis[0]).abs()) > 0.9999
+    off = (best.amount.abs().sort().values - truth.amount.abs()).abs() * 180 / math.pi
+    assert float(off.max()) < 1.5
+
+
+def test_one_door_stays_one():
+    (start, end), _ = both(shell(door(-0.6, 0.6, -0.6, 0.6, True, 40)))
+    found = discover(start, end, "auto", DiscoveryConfig(surfels=4000, searches=1))
+    assert len(found.motions) == 1
+    problem, motions = found.problem, as_motions(found.motions[0].transform[None], ["revolute"])
+    labelling = label(problem, motions, found.graphs)
+    alone = total_score(problem, motions, labelling)
+    two = parted(problem, found.graphs, labelling, motions, 0, static_axes(problem))
+    assert all(total_score(problem, m, label(problem, m, found.graphs)) > alone for m in two)
+
+
+def test_where_a_part_lands_on_another_it_is_as_wrong_as_in_empty_space(stacked):
+    problem, graphs, _, truth = stacked
+    right = label(problem, truth, graphs)
+    swapped = Labelling([right.probability[0][:, [0, 2, 1]], right.probability[1]], right.cost)
+    index = (right.labels(1) == 1).nonzero()[:, 0]
+    good = violation(problem, truth, right, 1, index)
+    assert float(good.mean()) < 0.35 and float(violation(problem, truth, swapped, 1, index).mean()) > float(good.mean()) + 0.1
+    lost = Labelling([torch.eye(3)[torch.zeros(len(p), dtype=torch.long)] for p in right.probability], right.cost)
+    moved = problem.moved[1].nonzero()[:, 0]
+    assert bool((violation(problem, truth, lost, 1, moved) == 1).all())  # what moved is called static
 
 
 def test_classify_needs_enough_views_and_a_majority():

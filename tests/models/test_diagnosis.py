@@ -26,9 +26,9 @@ def small_run(found=None, polish_steps=0):
     n = len(labels)
     told = {
         "explanation": 0,
-        "contests": [{"explanation": 0, "types": ["revolute"], "rank": 0.1}],
+        "reconsidered": [{"change": "parted", "part": 0, "type": "revolute", "cost": 0.1, "after": 0.0987, "proposed": 0.1, "energy": 0.0213}],
         "explanations": [{"types": ["revolute"], "cost": 0.1, "rank": 0.1, "reductions": [
-            {"change": "drop", "type": "prismatic", "cost_with": 0.1, "cost_without": 0.1001, "allowed": 0.1006}]}],
+            {"change": "drop", "type": "prismatic", "cost_with": 0.1, "cost_without": 0.1001, "energy": -0.029}]}],
         "evidence": [labels.to(torch.int8)] * 2,
         "states": [{"moved": 300, "static": 300, "unknown": 0}] * 2,
         "min_opacity": 0.5,
@@ -139,14 +139,13 @@ def test_both_files_are_the_same_when_written_again(tmp_path):
     assert "start: 11 that the other state says nothing of, 7 gave way to the walls behind" in page
 
 
-def test_the_page_tells_where_reconsidered_explanations_led(tmp_path):
+def test_the_page_tells_what_was_tried(tmp_path):
     stages, twin, views = small_run()
     d = write_diagnosis(tmp_path, stages, twin, views, min_margin=0.1)
-    assert d["discovery"]["contests"][0]["rank"] == 0.1 and "where that led" not in (tmp_path / "diagnostics.html").read_text()
-    d["discovery"]["explanations"].append({"types": ["revolute"], "cost": 0.12, "rank": 0.12})
-    d["discovery"]["contests"].append({"explanation": 1, "types": ["prismatic", "revolute"], "rank": 0.0987})
-    html = page(d, [], "run")
-    assert html.count("where that led") == 2 and "0.099" in html and "prismatic, revolute" in html
+    html = (tmp_path / "diagnostics.html").read_text()
+    assert d["discovery"]["reconsidered"][0]["change"] == "parted" and "0.0987" in html and "+0.0213" in html
+    d["discovery"]["reconsidered"] = [{"change": "one part a body", "part": 0, "bodies": [[40, 40], [50, 50]]}]
+    assert "tried on the chosen one" not in page(d, [], "run")
 
 
 def test_without_discovery_and_without_parts(tmp_path):

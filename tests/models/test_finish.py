@@ -1,6 +1,7 @@
 """Labels, slots and joints at the end; parts that are one become one."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import torch
 from tiny import hinge, photographs, slide, textured_panels
@@ -20,7 +21,7 @@ from p2gs.models.finish import (
 from p2gs.models.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.joint_confidence import state_depth
 from p2gs.models.part_choices import join_twins, simplify, without_part
-from p2gs.models.part_motions import PartMotionsConfig
+from p2gs.models.refine_motions import Judge
 from p2gs.models.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors, Similarity
@@ -81,18 +82,19 @@ def test_without_part_renumbers():
     assert without_part(motions, 0, 0).labels[0].tolist() == [0, 0, 1, 2]
 
 
-def test_one_part_cut_in_two_becomes_one_and_a_true_part_stays():
+def test_one_part_cut_in_two_becomes_one_and_a_true_part_stays(monkeypatch):
     states, labels, views = two_states(hinge())
     cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
     near = se3.from_screw(torch.tensor([0.0, 0.1, 1]).double(), torch.tensor([0.4, 0.5, 0]).double(), 0.51)
     motions = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [cut, cut], [torch.ones(len(cut))] * 2)
-    config = PartMotionsConfig(coarse=PolishConfig(levels=[64], level_starts=[0.0]))
     stacks = [state_depth(s, views[s.state], 64) for s in states]
-    simple = simplify(states, motions, views, config, stacks, backend="auto")
+    judge = Judge(SimpleNamespace(search=None), states, views, PolishConfig(levels=[64], level_starts=[0.0]), stacks, 0, "auto")
+    monkeypatch.setattr("p2gs.models.refine_motions.surface_energy", lambda found, T, types: 0.03 * len(types))  # the price of parts alone
+    simple = simplify(judge, motions, 0.04)
     assert len(simple) == 1 and torch.equal(simple.labels[0], labels)
     # the start hides one of the pieces: that they touch shows in the end
     half = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [labels, cut], [torch.ones(len(cut))] * 2)
-    simple = simplify(states, half, views, config, stacks, backend="auto")
+    simple = simplify(judge, half, 0.04)
     assert len(simple) == 1 and torch.equal(simple.labels[1], labels)
 
 

@@ -1,5 +1,7 @@
 """Pieces of a part that hang apart from it, and shifted parts that cover themselves."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from test_finish import two_states
@@ -9,7 +11,7 @@ from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import PartMotions
 from p2gs.models.islands import find_islands, pieces, settle_islands, settle_twin_islands
 from p2gs.models.part_pull import facing
-from p2gs.models.refine_motions import leave_false_minima, survey
+from p2gs.models.refine_motions import Judge, leave_false_minima, survey
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors
@@ -116,13 +118,14 @@ def test_survey_leaves_a_false_minimum(kind, truth):
     motions = PartMotions([kind], off[None], torch.ones(1), [labels, labels], margins)
     config = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0)
     stacks = [None, None]  # not looked at: nothing is left out, all views count
+    judge = Judge(SimpleNamespace(search=None), states, views, config, stacks, 0, "auto")
     assert survey(states, motions, views, config, stacks, [], backend="auto")[1] == []
     moved, which = survey(states, motions, views, config, stacks, [0.06, 0.12], backend="auto")
     error = [float((T[:3, 3] - truth[:3, 3]).norm()) for T in (off, moved.transforms[0])]
     assert which == [0] and error[1] < 0.5 * error[0]
-    better, which = leave_false_minima(states, motions, views, config, stacks, [0.06, 0.12], seed=0, backend="auto")
+    better, which = leave_false_minima(judge, motions, [0.06, 0.12])
     assert which == [0] and float((better.transforms[0, :3, 3] - truth[:3, 3]).norm()) < 0.02
-    assert leave_false_minima(states, motions, views, config, stacks, [], seed=0, backend="auto") == (motions, [])
+    assert leave_false_minima(judge, motions, []) == (motions, [])
 
 
 @pytest.mark.parametrize("wall_in_front", [True, False])

@@ -253,6 +253,17 @@ def test_view_counts_against_torch(isa, threads, n):
         assert bool((torch.stack(stack.counts(points, 0.05)).sum(1) > 500).all())
 
 
+@pytest.mark.parametrize("n", [0, 1, 31, 5000])
+def test_view_directions_against_torch(isa, threads, n):
+    """A point that rounding carries into the next pixel may be seen by one camera more or less."""
+    stack, points = make_stack(), torch.randn(n, 3)
+    got, expected = stack.seen_from(points, 0.05), stack.seen_from_reference(points, 0.05)
+    assert got.shape == (n, 3) and got.dtype == torch.float32
+    assert int(((got - expected).abs().amax(1) > 1e-5).sum()) <= n // 500 if n else True
+    if n == 5000:
+        assert int((expected.norm(dim=1) > 0.5).sum()) > 100
+
+
 def test_view_counts_of_what_is_not_finite(isa):
     stack, points = make_stack(), torch.randn(40, 3)
     points[3], points[7, 1], points[20, 2] = float("nan"), float("inf"), -float("inf")

@@ -20,9 +20,7 @@ class DiscoveryConfig:
     attach: weight of the rule that a hinge touches the part it carries.
     slide_bonus: a slide has two degrees of freedom less than a turn: share of a part's gain in its favour.
     thickest: greatest thickness of a plate of which the states may show different sides, times the box diagonal.
-    split: least share of its residual that half a part must lose with an amount of its own.
     min_mass: least share of the moved surface of a part.  min_moved: fewest moved surfels a state below which nothing moved.
-    search_weight: weight of the search's own value beside the image-space violation when explanations are ranked.
     searches: how often the set is searched, each time among other samples.  candidates: best sets of each that are looked into.
     """
 
@@ -40,9 +38,7 @@ class DiscoveryConfig:
     attach: float = 0.8
     slide_bonus: float = 0.1
     thickest: float = 0.04
-    split: float = 0.3
     min_mass: float = 0.015
     min_moved: int = 12
-    search_weight: float = 1.0
     searches: int = 2
     candidates: int = 4

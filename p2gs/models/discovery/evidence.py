@@ -103,12 +103,17 @@ class DepthStack:
             return self.counts_reference(points, tau, views)
         if len(views) and not 0 <= int(views.min()) <= int(views.max()) < len(self):
             raise IndexError(f"views {views.tolist()} of {len(self)}")
+        out = self._asked(native.depth_counts, points, tau, views)
+        return out[0], out[1], out[2]
+
+    def _asked(self, kernel, points: Tensor, tau: float, views: Tensor) -> Tensor:
+        """What a kernel over depth maps makes of points [N, 3]: [3, N]."""
         views, points, out = views.contiguous(), points.contiguous(), torch.empty(3, len(points))
-        native.depth_counts(
+        kernel(
             self.near.data_ptr(), self.far.data_ptr(), self.rows.data_ptr(), *self.depth.shape[1:], views.data_ptr(), len(views), tau,
             points.data_ptr(), len(points), out.data_ptr(), num_threads(),
         )  # fmt: skip
-        return out[0], out[1], out[2]
+        return out
 
     def counts_reference(self, points: Tensor, tau: float, views: Tensor, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, Tensor]:
         """``counts`` in torch, ``chunk`` points times views at once."""
@@ -129,6 +134,13 @@ class DepthStack:
 
         tau: tolerance along the ray, scene units.
         """
+        if native is None or points.dtype != torch.float32 or points.device.type != "cpu":
+            return self.seen_from_reference(points, tau)
+        sums = self._asked(native.depth_directions, points, tau, torch.arange(len(self)))
+        return torch.nn.functional.normalize(sums.T.contiguous(), dim=1)
+
+    def seen_from_reference(self, points: Tensor, tau: float) -> Tensor:
+        """``seen_from`` in torch."""
         views = torch.arange(len(self))
         out = torch.zeros_like(points)
         step = max(1, (1 << 20) // len(self))

@@ -1,4 +1,4 @@
-"""From a chosen set of motions to parts: labels, fits to the labelled points, splitting of parts that share a joint axis, scores."""
+"""From a chosen set of motions to parts: labels, and fits to the labelled points."""
 
 from __future__ import annotations
 
@@ -84,59 +84,6 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
         if float(1 - v[best] / 2) < 1.12 * float(1 - value / 2) + 0.03:
             return on_axis[best : best + 1]
     return free
-
-
-def split_amounts(
-    problem: Problem, labelling: Labelling, graphs: list[Graph], motions: Motions, k: int, steps: int = 25
-) -> tuple[float, float, float]:
-    """Do two amounts about one axis explain part k better than one?  (evidence, amount a, amount b).
-
-    Costs of every moved point over amounts within four tolerances, averaged over neighbours. Of the best pair, the evidence is what
-    the smaller half saves against the best single amount, relative to its cost, in the state where it saves less; nothing when the
-    amounts differ by less than 0.9 tolerances: that is what noise does to one part.
-    """
-    m = motions[k : k + 1]
-    tp = problem.scale.tp
-    arm = 0.2 * problem.scale.diag if bool(m.turn) else 1.0
-    delta = torch.linspace(-4, 4, steps) * tp / arm
-    many = Motions(m.turn.expand(steps), m.axis.expand(steps, 3), m.centre.expand(steps, 3), m.amount + delta, m.thick.expand(steps))
-    none = (0.0, float(m.amount), float(m.amount))
-    costs = []
-    for s in (0, 1):
-        index = torch.nonzero((labelling.labels(s) == k + 1) & problem.moved[s])[:, 0]
-        if len(index) < 20:
-            return none
-        c = problem.cost(many, s, index)[0].T  # [P, D]
-        full = torch.zeros(len(problem.surfels[s]), steps)
-        have = torch.zeros(len(problem.surfels[s]), 1)
-        full[index], have[index] = c, 1.0
-        for _ in range(8):
-            full = graphs[s].average(full * have) / graphs[s].average(have).clamp_min(1e-3) * have
-            full[index] = 0.5 * full[index] + 0.5 * c
-        costs.append(full[index])
-    single = sum(c.mean(0) for c in costs)
-    pair = sum(torch.minimum(c[:, :, None], c[:, None, :]).mean(0) for c in costs)
-    far = (delta[:, None] - delta[None]).abs() * arm >= 0.9 * tp
-    pair = torch.where(far, pair, torch.full_like(pair, 9.0))
-    a, b = divmod(int(pair.argmin()), steps)
-    best = int(single.argmin())
-    evidence = []
-    for c in costs:
-        second = c[:, b] < c[:, a]
-        half = second if second.float().mean() < 0.5 else ~second
-        if int(half.sum()) < 10:
-            return none
-        before, after = c[half, best].mean(), torch.minimum(c[half, a], c[half, b]).mean()
-        evidence.append(float((before - after) / before.clamp_min(0.03)) * min(1.0, float(half.float().mean()) / 0.1))
-    return min(evidence), float(many.amount[a]), float(many.amount[b])
-
-
-def with_amounts(motions: Motions, k: int, a: float, b: float) -> Motions:
-    """Part k takes amount a, a new last part the same axis and amount b."""
-    amount = motions.amount.clone()
-    amount[k] = a
-    new = Motions(motions.turn[k : k + 1], motions.axis[k : k + 1], motions.centre[k : k + 1], torch.tensor([b]), motions.thick[k : k + 1])
-    return Motions.cat([Motions(motions.turn, motions.axis, motions.centre, amount, motions.thick), new])
 
 
 def settle_parts(problem: Problem, graphs: list[Graph], motions: Motions, axes: Tensor, rounds: int = 2) -> tuple[Motions, Labelling]:

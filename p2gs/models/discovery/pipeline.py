@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 from typing import Callable, Optional
 
 import numpy as np
@@ -12,9 +11,10 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from p2gs.models.discovery.amounts import parted
 from p2gs.models.discovery.config import DiscoveryConfig
 from p2gs.models.discovery.evidence import StateEvidence
-from p2gs.models.discovery.finish import Explanation, settle_parts, split_amounts, with_amounts
+from p2gs.models.discovery.finish import Explanation, settle_parts
 from p2gs.models.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.models.discovery.labels import Graph, Labelling, label
 from p2gs.models.discovery.pool import plausibility
@@ -76,9 +76,11 @@ def discover(
             tell("selection", 0.2 + 0.5 * (number + 1) / searches)
             figures["search"].append({"motions_tried": len(swept.motions), **one.trace[-1]} if one.trace else {})
         lap("selection", 0.7)
-        explanations = [finish(problem, graphs, motions, value, most, limit, still) for value, motions in sets]
+        explanations = [finish(problem, graphs, motions, value, limit, still) for value, motions in sets]
         explanations += again(problem, graphs, search, explanations, limit, still)
         explanations = ranked(search, explanations)
+        best = [divided(problem, graphs, e, limit, still) for e in explanations[: config.candidates]]
+        explanations = ranked(search, best + explanations[config.candidates :])
         lap("labels", 0.95)
     if not explanations:
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]
@@ -114,12 +116,13 @@ def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate
 
 def surface_energy(found: Discovery, transforms: Tensor, types: list[str]) -> float:
     """What the surfaces say against motions [K, 4, 4], every surfel choosing anew: where they land in seen-free space or on what has another
-    colour, implausible joints, a price on each part, less what the motions explain. Lower is better; 0 without motions."""
-    if found.search is None or not types:
+    colour, moved surface that nothing carries, implausible joints, a price on each part, less what the motions explain. Lower is better; 0
+    where nothing moved."""
+    if found.search is None:
         return 0.0
     motions = sided(found.problem, as_motions(transforms, types))
     labelling = label(found.problem, motions, found.graphs)
-    return judged(found.search, Explanation(motions, labelling, 0.0, total_score(found.problem, motions, labelling))).score
+    return total_score(found.problem, motions, labelling)
 
 
 def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int | None, count: int = 2) -> list[tuple[Tensor, str]]:
@@ -144,6 +147,20 @@ def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int
     return [(motions.transform(i), "revolute" if bool(motions.turn[i]) else "prismatic") for i in picked]
 
 
+def in_two(found: Discovery, transforms: Tensor, types: list[str]) -> list[tuple[int, Tensor, list[str]]]:
+    """Each part as two bodies that move about one axis by amounts of their own, by the pairs that leave least of the moved surface
+    unexplained: (part, motions [K + 1, 4, 4] with the second body's last, their types)."""
+    if found.search is None:
+        return []
+    problem = found.problem
+    own, axes = sided(problem, as_motions(transforms, types)), static_axes(problem)
+    labelling, out = label(problem, own, found.graphs), []
+    for k in range(len(own)):
+        for more in parted(problem, found.graphs, labelling, own, k, axes):
+            out.append((k, torch.stack([more.transform(i) for i in range(len(more))]), [*types, types[k]]))
+    return out
+
+
 def sided(problem: Problem, motions: Motions) -> Motions:
     """The motions with the thickness of plate under which most of the moved surface arrives."""
     return two_sided(problem, motions, ExclusiveGain(problem, problem.samples, [torch.ones(len(s)) for s in problem.samples]))
@@ -157,28 +174,36 @@ def as_motions(transforms: Tensor, types: list[str]) -> Motions:
     return Motions(turn, screw.axis.float(), screw.origin.float(), amount.float())
 
 
-def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, most: int, limit: int, axes: Tensor) -> Explanation:
-    """Label and fit a chosen set; part those that share an axis but not an amount (up to ``most``); drop those without mass; score."""
-    cfg = problem.config
+def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, axes: Tensor) -> Explanation:
+    """Label and fit a chosen set; drop parts without mass, and those that the score is better without."""
     motions, labelling = settle_parts(problem, graphs, motions, axes)
     while (pair := twins(problem, motions, labelling)) is not None:
         motions, labelling = settle_parts(problem, graphs, without(motions, pair), axes)
-    while len(motions) < most:
-        tried = [split_amounts(problem, labelling, graphs, motions, k) for k in range(len(motions))]
-        k = max(range(len(tried)), key=lambda i: tried[i][0])
-        if tried[k][0] < cfg.split:
-            break
-        more, relabelled = settle_parts(problem, graphs, with_amounts(motions, k, *tried[k][1:]), axes)
-        if min(masses(problem, relabelled)) < cfg.min_mass or same_motion(problem, more, k, len(more) - 1):
-            break
-        motions, labelling = more, relabelled
     while len(motions):
         mass = masses(problem, labelling)
         k = min(range(len(mass)), key=lambda i: mass[i])
-        if mass[k] >= cfg.min_mass:
+        if mass[k] >= problem.config.min_mass:
             break
         motions, labelling = settle_parts(problem, graphs, without(motions, k), axes, rounds=1)
     return prune(problem, graphs, motions, labelling, value, limit, axes)
+
+
+def divided(problem: Problem, graphs: list[Graph], found: Explanation, limit: int, axes: Tensor) -> Explanation:
+    """Parts made two by amounts of their own about one axis (``parted``), up to ``limit`` parts, while the score falls."""
+    while 0 < len(found.motions) < limit:
+        best = found
+        for k in range(len(found.motions)):
+            for motions in parted(problem, graphs, found.labelling, found.motions, k, axes):
+                labelling = label(problem, motions, graphs)
+                score = total_score(problem, motions, labelling)
+                if score < best.score:
+                    best = Explanation(motions, labelling, found.value, score)
+        if best is found:
+            break
+        motions, labelling = settle_parts(problem, graphs, best.motions, axes, rounds=1)
+        score = total_score(problem, motions, labelling)
+        found = min(best, Explanation(motions, labelling, found.value, score), key=lambda e: e.score)
+    return found
 
 
 def again(problem: Problem, graphs: list[Graph], search: Search, found: list[Explanation], limit: int, axes: Tensor) -> list[Explanation]:
@@ -193,21 +218,14 @@ def again(problem: Problem, graphs: list[Graph], search: Search, found: list[Exp
         if chosen and not any(search.same(chosen, other) for other in known):
             known.append(chosen)
             motions = search.pool.motions[torch.tensor(chosen)]
-            out.append(finish(problem, graphs, motions, search.value(chosen), search.limit, limit, axes))
+            out.append(finish(problem, graphs, motions, search.value(chosen), limit, axes))
     return out
 
 
-def judged(search: Search, e: Explanation) -> Explanation:
-    """The explanation with what the search says of its motions as they are now: value, and score with it."""
-    cfg = search.problem.config
-    value = search.pool.total(search.pool.add(e.motions).tolist())
-    return replace(e, value=value, score=e.score + 0.2 * cfg.part_cost * len(e.motions) - cfg.search_weight * value)
-
-
 def ranked(search: Search, found: list[Explanation]) -> list[Explanation]:
-    """Judged, best first, without those whose motions all agree with a better one's."""
+    """Best first, without those whose motions all agree with a better one's."""
     out: list[Explanation] = []
-    for e in sorted((judged(search, e) for e in found), key=lambda e: e.score):
+    for e in sorted(found, key=lambda e: e.score):
         if not any(search.agree(e.motions, better.motions) for better in out):
             out.append(e)
     return out
@@ -240,12 +258,6 @@ def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> flo
     return image_score(problem, motions, labelling) + problem.config.part_cost * len(motions) + 0.5 * doubt
 
 
-def same_motion(problem: Problem, motions: Motions, i: int, j: int) -> bool:
-    """Do two motions differ by less than the surfaces' own disagreement?"""
-    probe = torch.cat([problem.surfels[s].points[problem.samples[s]] for s in (0, 1)])
-    return float(motions[i : i + 1].swept(probe, motions[j : j + 1])) < 0.7 * problem.scale.tp
-
-
 def twins(problem: Problem, motions: Motions, labelling: Labelling) -> int | None:
     """The smaller part of two that touch and whose motions carry their points to the same places, to within the tolerance across surfaces:
     surfaces cannot tell them apart (the photographs are asked later). None where there are no such two."""
@@ -272,14 +284,11 @@ def without(motions: Motions, k: int) -> Motions:
 
 
 def masses(problem: Problem, labelling: Labelling) -> list[float]:
-    """Share of the moved surface of each part, mean of both states."""
-    K = labelling.probability[0].shape[1] - 1
-    out = torch.zeros(K)
+    """Share of the moved surface of both states of each part."""
+    out = torch.zeros(labelling.probability[0].shape[1])
     for s in (0, 1):
-        w = problem.trust[s] * problem.moved[s]
-        if float(w.sum()) > 0:
-            out += torch.zeros(K + 1).index_add(0, labelling.labels(s), w)[1:] / w.sum() / 2
-    return out.tolist()
+        out.index_add_(0, labelling.labels(s), problem.trust[s] * problem.moved[s])
+    return (out[1:] / out.sum().clamp_min(1e-9)).tolist()
 
 
 def describe(problem: Problem, e: Explanation, start: StateEvidence, end: StateEvidence) -> Candidate:
@@ -294,14 +303,14 @@ def found_motions(problem: Problem, motions: Motions, labelling: Labelling) -> l
     """Each motion in words, with its confidence and mass under the labels."""
     found = []
     mass = masses(problem, labelling)
-    bad = [violation(problem, motions, labelling.labels(s), s) for s in (0, 1)]
     pays = [p for p, _ in problem.pay(motions)] if len(motions) else []
     plausible = plausibility(problem, motions, pays, problem.samples, False) if len(motions) else torch.zeros(0)
     for k in range(len(motions)):
         T = motions.transform(k)
         turn = bool(motions.turn[k])
         mine = [labelling.labels(s) == k + 1 for s in (0, 1)]
-        agree = [1 - float(bad[s][mine[s]].mean()) if mine[s].any() else 0.0 for s in (0, 1)]
+        rows = [of.nonzero()[:, 0] for of in mine]
+        agree = [1 - float(violation(problem, motions, labelling, s, i).mean()) if len(i) else 0.0 for s, i in enumerate(rows)]
         middle = problem.surfels[0].points[mine[0]].mean(0).double() if mine[0].any() else problem.centre.double()
         axis = motions.axis[k].double()
         axis = axis / axis.norm()
