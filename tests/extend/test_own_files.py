@@ -75,17 +75,19 @@ num_parts: 3
 data: {depth: never}
 stages: [single_state, registration, discovery, sharpen, canonical_fusion, colours, articulation, finish]
 phases:
-  single_state: {steps: 150, initial_gaussians: 1500, levels: [32, 64], level_starts: [0.0, 0.3], losses: {own_grey:
-    {weight: 0.01}}, callbacks: {densify: {budget: 2000, every: 20}}}
-  discovery: {evidence_size: 64, reconsider: false, rounds: 1, split_reach: 0, survey: [], coarse: {steps: 5, levels:
-    [64]}, search: {surfels: 1500, samples: 80, searches: 1, candidates: 1}}
+  single_state:
+    {steps: 150, initial_gaussians: 1500, levels: [32, 64], level_starts: [0.0, 0.3],
+     losses: {own_grey: {weight: 0.01}}, callbacks: {densify: {budget: 2000, every: 20}}}
+  discovery:
+    {evidence_size: 64, reconsider: false, rounds: 1, survey: [], coarse: {steps: 5, levels: [64]},
+     search: {surfels: 1500, samples: 80, searches: 1, candidates: 1}}
   canonical_fusion: {steps: 6, levels: [64], level_starts: [0.0], canonical: {match_size: 300}}
   colours: {steps: 6, levels: [64], level_starts: [0.0], losses: {render: {}}, callbacks: {joint_log: {every: 2}}}
   articulation: {steps: 6, levels: [64], level_starts: [0.0], callbacks: {joint_log: {every: 3}}}
   finish: {polish: {steps: 8, levels: [64], level_starts: [0.0]}, tune: {steps: 4}}
 """
 
-BENCH = "{name: own, format: own_recipe, root: scenes, config: [preset/smoke.yaml, own.yaml], seeds: [0], threads: 2, export: [ply, urdf]}"
+BENCH = "{name: own, format: own_recipe, root: scenes, config: [preset/smoke.yaml, own.yaml], seeds: [0], threads: 1}"
 
 
 def p2gs(folder: Path, *words: str) -> subprocess.CompletedProcess:
@@ -131,7 +133,7 @@ def test_the_fit_used_all_five(desk, run):
     assert told["single_state_0"]["own_grey"][0] > 0 and "own_grey" not in told["articulation"]
     lines = [json.loads(line) for line in (run / "joints.jsonl").read_text().splitlines()]
     assert [(line["phase"], line["step"]) for line in lines] == [("colours", s) for s in (2, 4, 6)] + [("articulation", s) for s in (3, 6)]
-    assert (run / "metrics.json").is_file() and (run / "meshes" / "end" / "whole.ply").is_file() and list(run.rglob("*.urdf"))
+    assert (run / "metrics.json").is_file() and (run / "meshes" / "end" / "whole.ply").is_file()
     drew = (desk / "drawn.txt").read_text().split()
     assert {"fit", "export", "test"} <= set(drew)
 
@@ -166,7 +168,7 @@ def test_an_edit_of_ones_own_phase_makes_it_again_and_nothing_before_it(desk, ru
     text = file.read_text()
     try:
         file.write_text(text.replace("state, g = step % 2,", "state, g = (step + 1) % 2,"))
-        words = ["-c", str(run / "config.yaml"), "--threads", "2", "--run", str(run), "--only", "articulation"]
+        words = ["-c", str(run / "config.yaml"), "--threads", "1", "--run", str(run), "--only", "articulation"]
         done = p2gs(desk, "fit", *words)
     finally:
         file.write_text(text)
