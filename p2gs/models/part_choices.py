@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
 
 import torch
 from torch import Tensor
 
-from p2gs.models.discovery.evidence import DepthStack
 from p2gs.models.handover import PartMotions
-from p2gs.models.refine_motions import Judge, explanation_cost, refine
+from p2gs.models.refine_motions import Judge
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
-
-if TYPE_CHECKING:
-    from p2gs.models.part_motions import PartMotionsConfig
 
 
 def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None) -> PartMotions:
@@ -97,24 +93,20 @@ def without_part(motions: PartMotions, index: int, into: int) -> PartMotions:
     )
 
 
-def settle_types(
-    states, motions: PartMotions, views, config: PartMotionsConfig, stacks: list[DepthStack], *, seed: int, backend: str, device="cpu"
-) -> PartMotions:
-    """Fit both joint types where the angle leaves room for doubt, keep the one the images prefer; then refine with the types held."""
+def settle_types(judge: Judge, motions: PartMotions, below: float, penalty: float) -> PartMotions:
+    """Fit both joint types where a part turns by less than ``below`` (degrees), keep the one the images prefer; then refine with the types held.
 
-    def cost(m: PartMotions) -> float:
-        return explanation_cost(states, m, views, config.coarse, stacks, backend=backend, device=device)
-
+    penalty: share of the image loss by which a turn must win: it has two freedoms more.
+    """
     best = None
     for k in range(len(motions)):
-        angle = float(so3.rotation_angle(motions.transforms[k, :3, :3])) * 57.29578
-        if motions.types[k] != "revolute" or angle >= config.compare_types_below:
+        angle = math.degrees(float(so3.rotation_angle(motions.transforms[k, :3, :3])))
+        if motions.types[k] != "revolute" or angle >= below:
             continue
-        best = cost(motions) if best is None else best
-        other = min(_as_slides(states, motions, k), key=cost)
-        other = refine(states, other, views, config.coarse, stacks, seed=seed, backend=backend, device=device)
-        found = cost(other)
-        if found <= best * (1 + config.freedom_penalty):
+        best = judge.cost(motions) if best is None else best
+        other = judge.refine(min(_as_slides(judge.states, motions, k), key=judge.cost))
+        found = judge.cost(other)
+        if found <= best * (1 + penalty):
             motions, best = other, found
     return motions
 

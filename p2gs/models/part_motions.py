@@ -12,12 +12,12 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews
 from p2gs.models.bodies import Surfaces, one_part_a_body
-from p2gs.models.discovery import Discovery, DiscoveryConfig, discover, relabel
+from p2gs.models.discovery import Discovery, DiscoveryConfig, StateEvidence, discover, relabel
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.part_choices import join_twins, settle_types, simplify
 from p2gs.models.phase import PHASES
-from p2gs.models.refine_motions import Judge, energy, explanation_cost, leave_false_minima, refine
+from p2gs.models.refine_motions import Judge, leave_false_minima
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.models.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
 from p2gs.types import TwoStateScene, UserError
@@ -85,32 +85,64 @@ def find_part_motions(
     say = report or (lambda text: None)
     options = {"seed": seed, "backend": backend, "device": device}
     say("rendering depth of both states")
-    evidence = [
-        gather_evidence(s.gaussians, scene.select(state=s.state, split="train"), config.evidence_size, config.min_opacity, backend, device)
-        for s in states
-    ]
-    for s, seen in zip(states, evidence, strict=True):
-        if len(seen.points) < 10 or not any(bool((d > 0).any()) for d in seen.depths):
-            name = ("start", "end")[s.state]
-            raise UserError(f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)")
+    evidence = _evidence(states, scene, config, backend, device)
     say("looking for parts")
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
-    stacks = found.problem.stacks
-    explanations, looks = _explanations(found), []
-    if len(explanations) > config.candidates:
-        say(f"a quick look at {len(explanations)} explanations")
-        quick = replace(config.coarse, steps=config.look_steps, levels=config.coarse.levels[:1], level_starts=[0.0])
+    judge = Judge(found, states, views, config.coarse, found.problem.stacks, further=config.part_penalty, **options)
+    explanations, looks = _looked_at(judge, _explanations(found), config, say)
+    motions, compared = _compared(judge, explanations, config, say)
+    limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
+    motions, improved = _improved(judge, motions, limit, config, say)
+    say("settling labels and motions")
+    motions, rounds = settle_labels(judge, motions, config)
+    motions, joined = join_twins(states, motions, found.problem.scale.tp)
+    if joined:
+        motions = judge.refine(motions)
+    motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
+    for part in unfounded:
+        say(f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})")
+    motions.diagnostics = {
+        "first_looks": looks,
+        "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],  # of the Gaussians above min_opacity
+        "min_opacity": config.min_opacity,
+        **compared,
+        **improved,
+        "rounds": rounds,
+        "joined": joined,
+        "unfounded": unfounded,
+        **_plain(found.diagnostics),
+    }
+    return motions
 
-        def first_look(explanation) -> float:
-            motions = refine(states, _label_states(explanation, states), views, quick, stacks, **options)
-            return energy(found, motions, explanation_cost(states, motions, views, quick, stacks, backend=backend, device=device))
 
-        looks = [first_look(e) for e in explanations]
-        order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
-        explanations = [explanations[i] for i in order]
-    judge, refined, tried = Judge(found, states, views, config.coarse, stacks, further=config.part_penalty, **options), [], []
+def _evidence(states: list[StateGaussians], scene: TwoStateScene, config: PartMotionsConfig, backend: str, device) -> list[StateEvidence]:
+    """Surface points and rendered depth of both states. Raises UserError where there are none."""
+    out = []
+    for s in states:
+        seen = scene.select(state=s.state, split="train")
+        out.append(gather_evidence(s.gaussians, seen, config.evidence_size, config.min_opacity, backend, device))
+        if len(out[-1].points) < 10 or not any(bool((d > 0).any()) for d in out[-1].depths):
+            name = ("start", "end")[s.state]
+            raise UserError(f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)")
+    return out
+
+
+def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[list, list[float]]:
+    """The ``candidates`` explanations that look best after a few steps at the smallest size, and the energies of all then."""
+    if len(explanations) <= config.candidates:
+        return explanations, []
+    say(f"a quick look at {len(explanations)} explanations")
+    quick = replace(judge, config=replace(config.coarse, steps=config.look_steps, levels=config.coarse.levels[:1], level_starts=[0.0]))
+    looks = [quick(quick.refine(_label_states(e, judge.states)))[0] for e in explanations]
+    order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
+    return [explanations[i] for i in order], looks
+
+
+def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
+    """The explanation of lowest energy, refined and without parts that it is better without; which it was, and what each came to."""
+    refined, tried = [], []
     for number, explanation in enumerate(explanations):
-        motions = _label_states(explanation, states)
+        motions = _label_states(explanation, judge.states)
         if len(explanations) > 1:
             say(f"re-rendering explanation {number + 1} of {len(explanations)}")
         reductions: list[dict] = []
@@ -118,10 +150,14 @@ def find_part_motions(
         rank, cost = judge(motions)
         tried.append({"types": motions.types, "cost": cost, "rank": rank, "value": explanation.value, "reductions": reductions})
         refined.append((rank, number, motions))
-    rank, number, motions = min(refined, key=lambda t: t[:2])
-    limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
-    motions = settle_types(states, motions, views, config, stacks, **options)
-    motions, bodies = one_part_a_body(states, motions, labelled_surfaces(found, motions.transforms, motions.types), limit)
+    _, number, motions = min(refined, key=lambda t: t[:2])
+    return motions, {"explanation": number, "explanations": tried}
+
+
+def _improved(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
+    """Types settled, bodies told apart, false minima left, each part reconsidered; what was done."""
+    motions = settle_types(judge, motions, config.compare_types_below, config.freedom_penalty)
+    motions, bodies = one_part_a_body(judge.states, motions, labelled_surfaces(judge.found, motions.transforms, motions.types), limit)
     if bodies:
         motions = judge.improved(motions)[2]
     changed: list[dict] = [{"change": "one part a body", **b} for b in bodies]
@@ -131,28 +167,7 @@ def find_part_motions(
         motions, reconsidered = reconsider(judge, motions, limit)
         changed += reconsidered
         motions = simplify(judge, motions, config.same_motion, changed)
-    say("settling labels and motions")
-    motions, rounds = settle_labels(judge, motions, config)
-    motions, joined = join_twins(states, motions, found.problem.scale.tp)
-    if joined:
-        motions = refine(states, motions, views, config.coarse, stacks, **options)
-    motions, unfounded = drop_unfounded(found, states, motions, views, config, stacks, **options)
-    for part in unfounded:
-        say(f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})")
-    motions.diagnostics = {
-        "explanation": number,
-        "first_looks": looks,
-        "explanations": tried,
-        "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],  # of the Gaussians above min_opacity
-        "min_opacity": config.min_opacity,
-        "shifted": shifted,
-        "reconsidered": changed,
-        "rounds": rounds,
-        "joined": joined,
-        "unfounded": unfounded,
-        **_plain(found.diagnostics),
-    }
-    return motions
+    return motions, {"shifted": shifted, "reconsidered": changed}
 
 
 def labelled_surfaces(found: Discovery, transforms: Tensor, types: list[str]) -> Surfaces:

@@ -98,8 +98,11 @@ def energy(found: Discovery | None, motions: PartMotions, loss: float) -> float:
 
 @dataclass
 class Judge:
-    """By what explanations are compared and refined.  found: discovery's problem (None: photographs alone).  stacks: rendered depth of both states.  further: share of
-    the image loss that a further part must save."""
+    """By what explanations are compared and refined.
+
+    found: discovery's problem (None: photographs alone).  stacks: rendered depth of both states.  further: share of the image loss that a
+    further part must save.
+    """
 
     found: Discovery | None
     states: list
@@ -111,10 +114,14 @@ class Judge:
     device: torch.device | str = "cpu"
     further: float = 0.0
 
+    def cost(self, motions: PartMotions) -> float:
+        """Image loss (``explanation_cost``)."""
+        options = {"backend": self.backend, "device": self.device}
+        return explanation_cost(self.states, motions, self.views, self.config, self.stacks, **options)
+
     def __call__(self, motions: PartMotions) -> tuple[float, float]:
         """Energy and image loss."""
-        options = {"backend": self.backend, "device": self.device}
-        cost = explanation_cost(self.states, motions, self.views, self.config, self.stacks, **options)
+        cost = self.cost(motions)
         return energy(self.found, motions, cost), cost
 
     def refine(self, motions: PartMotions) -> PartMotions:

@@ -12,12 +12,11 @@ from p2gs.models.discovery import Candidate, Discovery, in_two, instead_of, rela
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.islands import settle_islands
 from p2gs.models.part_choices import settle_types, without_part
-from p2gs.models.refine_motions import Judge, refine
+from p2gs.models.refine_motions import Judge
 from p2gs.ops.sh import dc_to_rgb
 
 if TYPE_CHECKING:
     from p2gs.models.part_motions import PartMotionsConfig
-
 
 
 def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
@@ -94,7 +93,6 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
     For up to ``rounds`` rounds, while the energy falls. Returns the motions and what each round measured.
     """
     found, states, rounds = judge.found, judge.states, []
-    options = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
     for number in range(config.rounds if len(motions) else 0):
         lowest, cost = judge(motions)
         best = None
@@ -108,23 +106,19 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
                 best = (value, tried)
         if best[0] >= lowest:
             break
-        motions = settle_types(states, best[1], judge.views, config, judge.stacks, **options)
+        motions = settle_types(judge, best[1], config.compare_types_below, config.freedom_penalty)
     return motions, rounds
 
 
-def drop_unfounded(
-    found: Discovery, states, motions: PartMotions, views, config: PartMotionsConfig, stacks, *, seed: int, backend: str, device="cpu"
-) -> tuple[PartMotions, list[dict]]:
-    """Without the parts whose confidence is below ``min_confidence``, the least first; labels are chosen anew and motions refined.
+def drop_unfounded(judge: Judge, motions: PartMotions, least: float) -> tuple[PartMotions, list[dict]]:
+    """Without the parts whose confidence is below ``least``, the least first; labels are chosen anew and motions refined.
 
     A part that only one state shows has a motion that nothing was observed of: it may explain the other state's photographs a little better
     (by hiding junk), and is no finding. Returns the motions, and type and confidence of each that went.
     """
     gone: list[dict] = []
-    while len(motions) and float(motions.confidence.min()) < config.min_confidence:
+    while len(motions) and float(motions.confidence.min()) < least:
         k = int(motions.confidence.argmin())
         gone.append({"type": motions.types[k], "confidence": float(motions.confidence[k])})
-        motions = _relabelled(found, states, without_part(motions, k, 0))
-    if gone:
-        motions = refine(states, motions, views, config.coarse, stacks, seed=seed, backend=backend, device=device)
-    return motions, gone
+        motions = _relabelled(judge.found, judge.states, without_part(motions, k, 0))
+    return (judge.refine(motions) if gone else motions), gone

@@ -9,7 +9,6 @@ from tiny import hinge, slide
 
 from p2gs.models import settle
 from p2gs.models.handover import PartMotions
-from p2gs.models.part_motions import PartMotionsConfig
 from p2gs.models.refine_motions import Judge
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.ops import se3
@@ -111,14 +110,13 @@ def test_a_part_of_which_one_state_shows_nothing_is_dropped(monkeypatch):
 
     monkeypatch.setattr(settle, "relabel", relabel)
     monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
-    config = PartMotionsConfig(coarse=COARSE)
-    options = {"seed": 0, "backend": "auto"}
+    judge = judge_of(states, views)
     two = PartMotions(["revolute", "prismatic"], torch.stack([hinge(), slide()]), torch.tensor([0.01, 0.4]), [labels * 2] * 2, margins)
-    kept, gone = settle.drop_unfounded(None, states, two, views, config, [None, None], **options)
+    kept, gone = settle.drop_unfounded(judge, two, 0.02)
     assert kept.types == ["prismatic"] and told == [["prismatic"]]
     assert gone == [{"type": "revolute", "confidence": pytest.approx(0.01)}]
     assert float((kept.transforms[0] - slide()).norm()) < 0.01
-    same, gone = settle.drop_unfounded(None, states, kept, views, config, [None, None], **options)
+    same, gone = settle.drop_unfounded(judge, kept, 0.02)
     assert same is kept and gone == []
-    none, gone = settle.drop_unfounded(None, states, two, views, PartMotionsConfig(min_confidence=0.0), [None, None], **options)
+    none, gone = settle.drop_unfounded(judge, two, 0.0)
     assert none is two and gone == []
