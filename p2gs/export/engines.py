@@ -74,6 +74,12 @@ class EngineResult:
                 out.append(f"from the {state} state a joint still moves at {speed:.3f} per s after {REST:g} s under gravity")
         return out
 
+    @property
+    def remark(self) -> str:
+        """How far the joint that went least went, and the fastest motion at rest."""
+        least = min((hi - lo for lo, hi in self.reached.values()), default=0.0)
+        return f"{len(self.reached)} joints, each through {100 * least:.0f} % of its range or more; at rest {max(self.speed):.1g} per s"
+
 
 def joint_facts(urdf: Path) -> list[JointFacts]:
     """The moving joints of a URDF; the recorded end is the limit that is not zero (the farther one, where the range was extended)."""

@@ -77,7 +77,8 @@ def test_the_command_prints_a_table_and_says_by_its_exit_code_whether_all_is_wel
     assert run(["export", str(tmp_path), "--check"]) == 2 and "has no twin.urdf to check" in capsys.readouterr().err
     write(clear_links(cabinet()).links, tmp_path)
     assert run(["export", str(tmp_path), "--check"]) == 0
-    assert "MuJoCo" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "MuJoCo" in told and " 2 joints" in told
     (tmp_path / "twin.xml").write_text("<mujoco><body/></mujoco>")
     assert run(["export", str(tmp_path), "--check"]) == 1 and "is not there" in capsys.readouterr().out
     (tmp_path / "twin.xml").write_text("<mujoco>")
