@@ -50,4 +50,7 @@
     redraw();
   });
   canvas.dispatchEvent(new Event("ready")); // the mesh's viewer tells once more what it shows
-})();
+})().catch((error) => {
+  document.getElementById("splats-note").textContent = "The Gaussians cannot be shown in this browser: " + error.message;
+  throw error;
+});
