@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import tempfile
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Sequence
 
 from p2gs.export.validators import VALIDATORS, Judged, Validator
 from p2gs.types import UserError
@@ -51,12 +55,22 @@ def _check(tool: str, validator: Validator, folder: Path) -> Checked:
     missing = [name for name in validator.files if not (folder / name).is_file()]
     if missing:
         return Checked(tool, file, "not run", (f"{missing[0]} is not there",))
-    try:
-        found = validator.run(folder)
-    except Exception as err:  # a file that an engine refuses is a finding, whatever it raises
-        found = Judged((f"{type(err).__name__}: {' '.join(str(err).split())[:300]}",))
+    found = judged_apart([sys.executable, "-m", "p2gs.export.validators", tool, str(folder)])
     notes = (*found.problems, *([found.remark] if found.remark else []))
     return Checked(tool, file, "fails" if found.problems else "passes", notes)
+
+
+def judged_apart(words: Sequence[str]) -> Judged:
+    """What a process of its own writes as JSON into the file that is its last argument: engines may crash, and print what they like."""
+    with tempfile.TemporaryDirectory() as scratch:
+        told = Path(scratch) / "judged.json"
+        done = subprocess.run([*words, str(told)], capture_output=True, text=True, errors="replace")
+        if done.returncode == 0 and told.is_file():
+            found = json.loads(told.read_text())
+            return Judged(tuple(found["problems"]), found["remark"])
+    how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+    last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+    return Judged((f"it crashed with {how}: {last[:300]}",))
 
 
 def check_table(results: list[Checked]) -> "Table":

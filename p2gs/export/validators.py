@@ -8,7 +8,8 @@ import json
 import os
 import shutil
 import subprocess
-from dataclasses import dataclass
+import sys
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Callable
 
@@ -147,3 +148,16 @@ VALIDATORS = {
     "gltf-validator": Validator("", ("twin.glb",), _gltf("twin.glb"), NPM),
     "gltf-validator, splats": Validator("", ("splats.glb",), _gltf("splats.glb"), NPM),
 }
+
+
+def main(tool: str, folder: str, told: str) -> None:
+    """One of ``VALIDATORS`` on a folder; its ``Judged`` goes into the file ``told`` as JSON."""
+    try:
+        found = VALIDATORS[tool].run(Path(folder))
+    except Exception as err:  # a file that a reader refuses is a finding, whatever it raises
+        found = Judged((f"{type(err).__name__}: {' '.join(str(err).split())[:300]}",))
+    Path(told).write_text(json.dumps(asdict(found)))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from test_engines import write
 from test_splat_files import with_splats
 
 from p2gs.export import validators
+from p2gs.export.check import judged_apart
 from p2gs.export.clearance import clear_links
 from p2gs.export.glb import write_glb
 from p2gs.export.splats_gltf import write_splats
@@ -49,6 +51,13 @@ def test_gltf_passes_but_for_the_extension_that_the_validator_does_not_know(name
     at = data.index(b'"nodes":[0]')
     path.write_bytes(data[:at] + b'"nodes":[9]' + data[at + 11 :])
     assert any("UNRESOLVED_REFERENCE" in p for p in validator.run(tmp_path).problems)
+
+
+def test_a_validator_that_crashes_is_a_finding(tmp_path):
+    found = judged_apart([sys.executable, "-c", "import os; os.abort()"])
+    assert len(found.problems) == 1 and "crashed with signal 6" in found.problems[0]
+    found = judged_apart([sys.executable, "-m", "p2gs.export.validators", "yourdfpy", str(tmp_path)])
+    assert len(found.problems) == 1 and "twin.urdf" in found.problems[0]
 
 
 def test_only_what_the_validator_cannot_know_of_splats_is_left_out(tmp_path, monkeypatch):
