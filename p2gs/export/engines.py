@@ -113,8 +113,10 @@ def run_engine(name: str, engine: Engine, facts: list[JointFacts]) -> EngineResu
 
 
 def _best_sweep(engine: Engine, facts: list[JointFacts], i: int, end: np.ndarray) -> tuple[float, float]:
+    """Of joint ``i`` with the others all at the start, all at the end, or one of them at the end, whichever lets it go farthest."""
+    single = [row for k, row in enumerate(np.eye(len(facts))) if k != i]
     best = (1.0, 0.0)
-    for share in (0.0, 1.0):
+    for share in (np.zeros(len(facts)), np.ones(len(facts)), *single):
         found = _sweep(engine, facts[i], i, share * end)
         if found[1] - found[0] > best[1] - best[0]:
             best = found
