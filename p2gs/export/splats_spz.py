@@ -1,4 +1,4 @@
-"""splats.spz: the Gaussians at the start state in Niantic's compressed format, a tenth of the PLY's size.
+"""splats.spz: the Gaussians at the start state in Niantic's compressed format, a fifth of the PLY's size.
 
 Version 3 of the format after its description (github.com/nianticlabs/spz, README): gzip over a header of 16 bytes and one block each of
 positions (24-bit fixed point), opacities, colours, logarithms of scales (8 bits each), rotations (the three smaller components of the
