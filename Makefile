@@ -1,4 +1,4 @@
-# make setup | demo | lint | test | fuzz | faults | sanitize | clean.  PYTHON chooses the interpreter that .venv is made of.
+# make setup | demo | lint | test | assets | fuzz | faults | sanitize | clean.  PYTHON chooses the interpreter that .venv is made of.
 PYTHON ?= python3
 BIN := .venv/bin
 NATIVE := $(wildcard p2gs/native/*.cpp p2gs/native/*.h p2gs/native/*.inc)
@@ -6,7 +6,7 @@ PLATLIB = $(shell $(BIN)/python -c "import sysconfig; print(sysconfig.get_path('
 # Idle threads of torch spin by default, on cores that the kernels want.
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: setup setup-dev native demo lint test faults fuzz sanitize clean
+.PHONY: setup setup-dev native demo lint test assets faults fuzz sanitize clean
 
 setup: .venv/.built
 
@@ -48,6 +48,10 @@ lint: setup-dev
 	$(BIN)/ruff format --check p2gs tests bench
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -q tests/test_imports.py
+
+# The demo's exports in every simulator and validator that pip and npm have.
+assets:
+	.ci/assets
 
 # Kills, full disks, damaged files: KILLS is how many times a run is killed. Hours at 100.
 faults: setup-dev

@@ -83,7 +83,7 @@ def parser(prog: str = "p2gs") -> Parser:
 
     export = add("export", "write a run's twin in other formats")
     export.add_argument("run", metavar="RUN", help="result folder of a fit")
-    export.add_argument("--format", nargs="+", metavar="NAME", help="urdf, mjcf, glb, usd, splats, ply, obj, all (default)")
+    export.add_argument("--format", nargs="+", metavar="NAME", help="urdf, mjcf, glb, usd, splats, spz, ply, obj, all (default)")
     told = "all that one simulator takes, named and textured, into --out: simready, isaac, mujoco, sapien, partnet"
     export.add_argument("--profile", metavar="NAME", help=told)
     export.add_argument("--meta", metavar="FILE", help="YAML or JSON with author, asset_license, category, qcode, ... for --profile")

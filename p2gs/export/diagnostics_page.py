@@ -13,7 +13,8 @@ import numpy as np
 
 from p2gs.data.box import INTERNAL_DIAGONAL
 from p2gs.export.diagnostics_pictures import diagnostic_strips
-from p2gs.export.report import chip, read_scalars, table
+from p2gs.export.report import read_scalars, table
+from p2gs.export.report_view import chip
 from p2gs.models.diagnosis import StageResults, diagnose
 from p2gs.models.verdict import LIMITS, STAGES, lost_at, verdicts
 from p2gs.types import ArticulatedObject, UserError

@@ -74,6 +74,12 @@ class EngineResult:
                 out.append(f"from the {state} state a joint still moves at {speed:.3f} per s after {REST:g} s under gravity")
         return out
 
+    @property
+    def remark(self) -> str:
+        """How far the joint that went least went, and the fastest motion at rest."""
+        least = min((hi - lo for lo, hi in self.reached.values()), default=0.0)
+        return f"{len(self.reached)} joints, each through {100 * least:.0f} % of its range or more; at rest {max(self.speed):.1g} per s"
+
 
 def joint_facts(urdf: Path) -> list[JointFacts]:
     """The moving joints of a URDF; the recorded end is the limit that is not zero (the farther one, where the range was extended)."""
@@ -107,8 +113,10 @@ def run_engine(name: str, engine: Engine, facts: list[JointFacts]) -> EngineResu
 
 
 def _best_sweep(engine: Engine, facts: list[JointFacts], i: int, end: np.ndarray) -> tuple[float, float]:
+    """Of joint ``i`` with the others all at the start, all at the end, or one of them at the end, whichever lets it go farthest."""
+    single = [row for k, row in enumerate(np.eye(len(facts))) if k != i]
     best = (1.0, 0.0)
-    for share in (0.0, 1.0):
+    for share in (np.zeros(len(facts)), np.ones(len(facts)), *single):
         found = _sweep(engine, facts[i], i, share * end)
         if found[1] - found[0] > best[1] - best[0]:
             best = found

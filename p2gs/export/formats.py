@@ -17,9 +17,10 @@ from p2gs.types import UserError
 
 Exporter = Callable[[Asset, Path], Path]
 EXPORTERS: Registry[Exporter] = Registry("export format")
-DEFAULT_UP = {"glb": "y", "splats": "y"}  # glTF's rule; the others take the input's z
-UNTEXTURED = {"ply", "splats"}
-FOR_LOOKS = {"glb", "ply", "obj", "splats"}  # hold no collision pieces or masses, which take most of an export's time
+SPLATS = {"splats", "spz"}  # hold Gaussians
+DEFAULT_UP = {"glb": "y", "splats": "y", "spz": "y"}  # glTF's and SPZ's rule; the others take the input's z
+UNTEXTURED = {"ply", *SPLATS}
+FOR_LOOKS = {"glb", "ply", "obj", *SPLATS}  # hold no collision pieces or masses, which take most of an export's time
 
 
 @EXPORTERS.register("urdf")
@@ -60,6 +61,14 @@ def splats(asset: Asset, out: Path) -> Path:
     from p2gs.export.splats_gltf import write_splats
 
     return write_splats(asset, out)
+
+
+@EXPORTERS.register("spz")
+def spz(asset: Asset, out: Path) -> Path:
+    """splats.spz: the Gaussians at the start state, compressed."""
+    from p2gs.export.splats_spz import write_spz
+
+    return write_spz(asset, out)
 
 
 @EXPORTERS.register("ply")
@@ -163,9 +172,9 @@ def export_run(
     for name, write in writers.items():
         axis = axes[name]
         if axis not in assets:
-            gaussians = chosen.splats or axes.get("splats") == axis
+            gaussians = chosen.splats or axis in {axes.get(kind) for kind in SPLATS}
             assets[axis] = chosen.load(run_dir, axis, axis in solid, gaussians, baker)
-        asset = assets[axis] if chosen.splats or name == "splats" else without_splats(assets[axis])
+        asset = assets[axis] if chosen.splats or name in SPLATS else without_splats(assets[axis])
         written.append(write(asset, out))
     told = next((text for text in map(open_note, assets.values()) if text), None)
     if told:

@@ -12,17 +12,16 @@ from typing import Any, Optional, Sequence
 
 import numpy as np
 
+from p2gs.export.report_view import chip, view_section
 from p2gs.export.twin_json import load_twin
-from p2gs.ops.palette import part_colour
 from p2gs.stage_times import stages_file, wall_seconds
 from p2gs.types import ArticulatedObject
 
-PAGE_FACES = 15_000  # triangles a part in the page's 3D view
 CURVE_COLOURS = ("#e07010", "#1a80d8", "#1aa672", "#d84088", "#8058cc", "#c9a020", "#60b8e8", "#909090")
 
 
 def write_report(run_dir: Path | str) -> Path:
-    """The page: 3D view with a slider per joint, pictures, joints, scores, losses, times. What the run does not have is left out.
+    """The page: mesh and splats in 3D with a slider per joint, pictures, joints, scores, losses, times. What the run lacks is left out.
 
     The 3D view needs RUN/meshes (made by ``write_meshes``); scores need RUN/metrics.json, which ``p2gs test`` writes.
     Raises UserError for a run without a twin.
@@ -52,38 +51,6 @@ def write_report(run_dir: Path | str) -> Path:
     path = run_dir / "report.html"
     path.write_text(page)
     return path
-
-
-def view_section(run_dir: Path, obj: ArticulatedObject) -> str:
-    """The 3D view; nothing without meshes."""
-    if not (run_dir / "meshes").is_dir():
-        return ""
-    from p2gs.export.asset import load_asset
-    from p2gs.export.glb import glb_bytes
-
-    asset = load_asset(run_dir, up="y", max_faces=PAGE_FACES, solid=False)
-    glb = base64.b64encode(glb_bytes(asset)).decode()
-    script = resources.files("p2gs.export").joinpath("report_viewer.js").read_text()
-    sliders = [
-        f'<label><span>{chip(link.part)}{link.part} {link.joint.type}</span><input type="range" min="0" max="1" step="0.005" value="0" '
-        f'data-part="{link.part}" aria-label="joint {link.part}"><output>0</output></label>'
-        for link in asset.moving
-    ]
-    return (
-        f'<h2>Move it</h2>\n<canvas id="view" data-turn="{front(obj):.3f}" aria-label="the object in 3D"></canvas>\n'
-        f'<p class="soft" id="view-note">Drag to turn, scroll or pinch to come nearer. Zero is the start state.</p>\n'
-        f'<div class="sliders">{"".join(sliders)}<label><span>part colours</span><input type="checkbox" id="paint"></label></div>\n'
-        f'<script type="text/plain" id="glb">{glb}</script>\n<script>\n{script}</script>'
-    )
-
-
-def front(obj: ArticulatedObject) -> float:
-    """Turn of the page's camera, radians about the up axis, towards the side on which the moving parts show best."""
-    from p2gs.export.views import best_camera, bounds, orbit
-
-    ring = orbit(obj, 24)
-    eye = ring[best_camera(obj, ring)].position.double() - bounds(obj).mean(0)
-    return math.atan2(float(eye[0]), -float(eye[1]))
 
 
 def picture_section(run_dir: Path) -> str:
@@ -234,12 +201,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Cells are HTML already."""
     body = "".join("<tr>" + "".join(f'<td class="bad">{c}</td>' if c == "F" else f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
     return f'<div class="scroll"><table><thead><tr>{"".join(f"<th>{h}</th>" for h in head)}</tr></thead><tbody>{body}</tbody></table></div>'
-
-
-def chip(part: int) -> str:
-    """A square of the part's colour."""
-    rgb = ",".join(str(round(255 * c)) for c in part_colour(part))
-    return f'<span class="chip" style="background:rgb({rgb})"></span>'
 
 
 def _vector(v: Any) -> str:

@@ -1,9 +1,10 @@
 // A small viewer: reads the GLB that p2gs wrote into the page, draws it with WebGL, one slider per joint. No library.
+// What it shows it tells as an event "shown" of its canvas, by which report_splats.js draws the Gaussians from the same side.
 (function () {
   "use strict";
   const canvas = document.getElementById("view");
   const note = document.getElementById("view-note");
-  const bytes = Uint8Array.from(atob(document.getElementById("glb").textContent.trim()), (c) => c.charCodeAt(0));
+  const bytes = Uint8Array.from(atob(document.querySelector("script.glb").textContent.trim()), (c) => c.charCodeAt(0));
   const head = new DataView(bytes.buffer);
   const jsonLength = head.getUint32(12, true);
   const doc = JSON.parse(new TextDecoder().decode(bytes.subarray(20, 20 + jsonLength)));
@@ -104,6 +105,8 @@
       gl.bindVertexArray(part.vao);
       gl.drawElements(gl.TRIANGLES, part.count, gl.UNSIGNED_INT, 0);
     }
+    const models = Object.fromEntries(parts.map((part) => [part.node.name, modelOf(part)]));
+    canvas.dispatchEvent(new CustomEvent("shown", { detail: { eye, right, up, back, cotangent: f, near, far, models } }));
   }
   for (const slider of document.querySelectorAll("input[data-part]")) {
     const part = parts.find((p) => p.node.name === "part_" + slider.dataset.part), out = slider.parentElement.querySelector("output");
@@ -122,9 +125,17 @@
   document.getElementById("paint").addEventListener("change", (e) => { paintParts = e.target.checked; draw(); });
 
   const fingers = new Map();
-  canvas.addEventListener("pointerdown", (e) => { fingers.set(e.pointerId, e); canvas.setPointerCapture(e.pointerId); });
-  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (e) => fingers.delete(e.pointerId));
-  canvas.addEventListener("pointermove", (e) => {
+  function steer(surface) {
+    surface.addEventListener("pointerdown", (e) => { fingers.set(e.pointerId, e); surface.setPointerCapture(e.pointerId); });
+    for (const name of ["pointerup", "pointercancel"]) surface.addEventListener(name, (e) => fingers.delete(e.pointerId));
+    surface.addEventListener("pointermove", turn);
+    surface.addEventListener("wheel", (e) => {
+      e.preventDefault();
+      view.distance = Math.max(1.2, Math.min(12, view.distance * Math.exp(e.deltaY * 0.001)));
+      draw();
+    }, { passive: false });
+  }
+  function turn(e) {
     const before = fingers.get(e.pointerId);
     if (!before) return;
     if (fingers.size === 1) {
@@ -137,12 +148,9 @@
     }
     fingers.set(e.pointerId, e);
     draw();
-  });
-  canvas.addEventListener("wheel", (e) => {
-    e.preventDefault();
-    view.distance = Math.max(1.2, Math.min(12, view.distance * Math.exp(e.deltaY * 0.001)));
-    draw();
-  }, { passive: false });
+  }
+  for (const surface of document.querySelectorAll("#view, #splats")) steer(surface);
+  document.getElementById("splats").addEventListener("ready", draw);
   new ResizeObserver(draw).observe(canvas);
   draw();
 })();

@@ -25,8 +25,7 @@ def write_urdf(asset: Asset, out: Path, mujoco: bool = True) -> Path:
     if mujoco:
         compiler = ET.SubElement(ET.SubElement(robot, "mujoco"), "compiler")
         compiler.attrib |= {
-            "meshdir": FOLDER,
-            "strippath": "true",
+            "strippath": "false",
             "fusestatic": "false",
             "discardvisual": "true",
             "balanceinertia": "true",

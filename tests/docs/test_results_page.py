@@ -88,7 +88,7 @@ def test_files(run):
         assert {path.name, path.name + "/"} & {name.split("/")[0] + ("/" if "/" in name else "") for name in listed}, path.name
     for path in (run / "splats").iterdir():
         assert {path.name, f"splats/{path.name}"} & listed
-    assert set(EXPORTERS) == {"urdf", "mjcf", "glb", "usd", "ply", "obj", "splats"}
+    assert set(EXPORTERS) == {"urdf", "mjcf", "glb", "usd", "ply", "obj", "splats", "spz"}
 
 
 def test_its_python(run, monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """The engines' checks pass on a twin with room, and fail on one whose joint is blocked or drifts."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from p2gs.export.asset import Asset
 from p2gs.export.check import check_folder
 from p2gs.export.clearance import clear_links
 from p2gs.export.convex import decompose
-from p2gs.export.engines import ENGINES, check_engine, installed
+from p2gs.export.engines import ENGINES, check_engine, installed, joint_facts, run_engine
 from p2gs.export.inertia import Inertia
 from p2gs.export.mjcf import write_mjcf
 from p2gs.export.urdf import write_urdf
@@ -21,8 +22,6 @@ from p2gs.types import UserError
 
 def with_looks(links):
     """Each link's first piece also as what it shows, and masses of wood."""
-    from dataclasses import replace
-
     from p2gs.export.inertia import effective_inertia, inertia_of
 
     out = []
@@ -63,6 +62,29 @@ def test_a_wall_in_the_way_is_found(name, tmp_path):
     assert "joint_1 moves from 0 to 5" in result.problems[0]
 
 
+@pytest.mark.parametrize("name", [n for n in ENGINES if installed(n)])
+def test_another_part_in_the_way_is_found(name, tmp_path):
+    """It is held where it was photographed."""
+    floor, box = block((-2, -2, -9), (2, 2, -8.9)), block((-0.2, -0.3, -0.1), (0.2, 0.3, 0.1))
+    near = block((-0.3, -0.8, -0.1), (0.3, -0.7, 0.1))
+    links = [link("base", [floor]), link("part_1", [box], slide((0, -1, 0), 0.8)), link("part_2", [near], slide((0, -1, 0), 0.8))]
+    folder = write(links, tmp_path)
+    facts = [replace(f, end=0.0) for f in joint_facts(folder / "twin.urdf")]  # with no other recorded state
+    reached = run_engine(name, ENGINES[name](folder), facts).reached["joint_1"]
+    assert reached[1] == pytest.approx(0.5, abs=0.05)  # MuJoCo's contacts are soft
+
+
+@pytest.mark.parametrize("name", [n for n in ENGINES if installed(n)])
+def test_a_joint_that_has_room_only_where_one_other_is_open_and_one_shut_is_found_free(name, tmp_path):
+    """The second part stands in the first one's way at the start, the third at the end."""
+    floor, box = block((-2, -2, -9), (2, 2, -8.9)), block((-0.2, -0.3, -0.1), (0.2, 0.3, 0.1))
+    near, far = block((-0.2, -0.8, -0.1), (0.2, -0.7, 0.1)), block((1.3, -0.8, -0.1), (1.7, -0.7, 0.1))
+    parts = [(box, slide((0, -1, 0), 0.8)), (near, slide((-1, 0, 0), 1.5)), (far, slide((-1, 0, 0), 1.5))]
+    links = [link("base", [floor]), *(link(f"part_{k}", [piece], joint) for k, (piece, joint) in enumerate(parts, 1))]
+    reached = check_engine(name, write(links, tmp_path)).reached["joint_1"]
+    assert reached[0] < 0.02 and reached[1] > 0.98
+
+
 @pytest.mark.parametrize("name", ["mujoco", "pybullet"])
 def test_what_slides_down_is_found(name, tmp_path):
     if not installed(name):
@@ -77,7 +99,8 @@ def test_the_command_prints_a_table_and_says_by_its_exit_code_whether_all_is_wel
     assert run(["export", str(tmp_path), "--check"]) == 2 and "has no twin.urdf to check" in capsys.readouterr().err
     write(clear_links(cabinet()).links, tmp_path)
     assert run(["export", str(tmp_path), "--check"]) == 0
-    assert "MuJoCo" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "MuJoCo" in told and " 2 joints" in told
     (tmp_path / "twin.xml").write_text("<mujoco><body/></mujoco>")
     assert run(["export", str(tmp_path), "--check"]) == 1 and "is not there" in capsys.readouterr().out
     (tmp_path / "twin.xml").write_text("<mujoco>")

@@ -1,16 +1,21 @@
 """The page about a run: what it says, that nothing in it comes from elsewhere, and, where there is a browser, that it works."""
 
+import base64
+import http.server
 import json
+import queue
 import re
 import shutil
 import subprocess
+import threading
 
 import numpy as np
 import pytest
 from toy import toy_scene, toy_twin
 
 from p2gs.export.mesh import write_meshes
-from p2gs.export.report import chart, front, is_loss, write_report
+from p2gs.export.report import chart, is_loss, write_report
+from p2gs.export.report_view import front
 from p2gs.export.run_folder import complete_run, write_twin
 from p2gs.types import UserError
 
@@ -82,14 +87,18 @@ def test_chart_leaves_out_what_a_logarithm_cannot_show():
     assert is_loss("articulation/render") and not is_loss("articulation/gaussians") and not is_loss("articulation/joint/1/motion")
 
 
+def chromium():
+    """Path of a headless Chromium; the test is skipped where there is none."""
+    names = ("chromium", "chromium-headless-shell", "chromium-browser", "google-chrome")
+    browser = next(filter(None, map(shutil.which, names)), None)
+    return browser or pytest.skip("no Chromium here")
+
+
 def test_in_a_browser_the_slider_moves_the_part(run, tmp_path):
     """Headless Chromium: no error on the console, something drawn, and another picture with the joint at its end."""
     import cv2
 
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium here")
-    page, shots = write_report(run), []
+    browser, page, shots = chromium(), write_report(run), []
     for state in ("1=0", "1=1"):
         shot = tmp_path / f"{state}.png"
         flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--enable-logging=stderr"]
@@ -101,6 +110,78 @@ def test_in_a_browser_the_slider_moves_the_part(run, tmp_path):
     canvas = slice(100, 400)
     assert shots[0][canvas].std() > 5  # not an empty view
     assert (np.abs(shots[0] - shots[1])[canvas].max(-1) > 30).mean() > 0.01
+
+
+WATCH = """<script>(function () {  // posts both canvases once the splats are there, and again with joint 1 at its end
+  const views = ["view", "splats"].map((id) => document.getElementById(id));
+  let before = "", moved = false;
+  setInterval(() => {
+    const shots = views.map((c) => c.toDataURL());
+    const blank = document.createElement("canvas");
+    [blank.width, blank.height] = [views[1].width, views[1].height];
+    if (shots[1] === blank.toDataURL() || shots[1] === before) return;
+    const still = shots[1] === window.last;  // sorting takes a moment
+    window.last = shots[1];
+    if (!still) return;
+    before = shots[1];
+    fetch("/", { method: "POST", body: JSON.stringify({ shots, loaded: performance.getEntriesByType("resource").map((r) => r.name) }) });
+    if (moved) return;
+    moved = true;
+    const slider = document.querySelector("input[data-part='1']");
+    slider.value = 1;
+    slider.dispatchEvent(new Event("input"));
+  }, 300);
+})();</script>"""
+
+
+@pytest.fixture
+def watched(run, tmp_path):
+    """What the page posts in a headless Chromium: pictures [H, W, 4] of the two canvases with joint 1 at its start and at its end, and
+    what the page loaded."""
+    browser, page = chromium(), (write_report(run).read_text() + WATCH).encode()
+    posts: queue.Queue = queue.Queue()
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.end_headers()
+            self.wfile.write(page)
+
+        def do_POST(self):
+            posts.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    flags = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--remote-debugging-port=0"]
+    flags += ["--window-size=500,700", f"--user-data-dir={tmp_path / 'profile'}"]
+    address = f"http://127.0.0.1:{server.server_port}/"
+    with subprocess.Popen([browser, *flags, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield address, [posts.get(timeout=60) for _ in range(2)]
+        finally:
+            process.terminate()
+            server.shutdown()
+            server.server_close()
+
+
+def test_in_a_browser_the_splats_stand_where_the_mesh_stands_and_move_with_it(watched):
+    import cv2
+
+    address, posts = watched
+    assert [n for post in posts for n in post["loaded"] if n.startswith("http") and not n.startswith(address)] == []
+    drawn = []
+    for post in posts:
+        pictures = [np.frombuffer(base64.b64decode(shot.split(",")[1]), np.uint8) for shot in post["shots"]]
+        mesh, splats = (cv2.imdecode(p, cv2.IMREAD_UNCHANGED)[..., 3] > 128 for p in pictures)
+        assert (mesh & splats).sum() > 0.8 * (mesh | splats).sum()
+        drawn.append(splats)
+    assert (drawn[0] ^ drawn[1]).sum() > 0.02 * drawn[0].sum()  # the door
 
 
 def test_a_stage_run_again_draws_one_curve(tmp_path):

@@ -258,7 +258,7 @@ def test_scale_up_and_origin(toy, tmp_path):
         export_run(toy, ["urfd"], tmp_path)
     files = export_run(toy, ["obj", "ply"], tmp_path)
     assert all((f / f"part_2.{s}").is_file() for f, s in zip(files, ("obj", "ply"), strict=True))
-    assert set(EXPORTERS) == {"urdf", "mjcf", "glb", "usd", "splats", "ply", "obj"}
+    assert set(EXPORTERS) == {"urdf", "mjcf", "glb", "usd", "splats", "spz", "ply", "obj"}
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])

@@ -1,6 +1,8 @@
 """splats.glb and the splats in USD: by other readers, the Gaussians of the twin in both states, in the parts' own frames."""
 
+import gzip
 import json
+import math
 import struct
 from dataclasses import replace
 
@@ -14,6 +16,7 @@ from toy import toy_twin
 from p2gs.export.asset import Asset, placement
 from p2gs.export.pose import pose
 from p2gs.export.splats_gltf import write_splats
+from p2gs.export.splats_spz import write_spz
 from p2gs.export.usd import write_usd
 from p2gs.ops.sh import evaluate
 from p2gs.types import ArticulatedObject
@@ -144,3 +147,64 @@ def test_usd_has_the_gaussians_under_their_rigid_body(tmp_path):
         assert (points > low).all() and (points < high).all()
     context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
     assert [e.GetMessage() for e in context.Validate(stage)] == []
+
+
+def read_spz(path):
+    """Splat by splat after the description in github.com/nianticlabs/spz: centres, opacities, colours, scales, turns xyzw, coefficients."""
+    data = gzip.decompress(path.read_bytes())
+    magic, version, n, degree, bits, flags, reserved = struct.unpack("<IIIBBBB", data[:16])
+    assert (data[:4], version, flags, reserved) == (b"NGSP", 3, 0, 0) and magic == 0x5053474E
+    higher = [0, 3, 8, 15][degree]
+    starts = np.cumsum([16, 9 * n, n, 3 * n, 3 * n, 4 * n, 3 * higher * n])
+    assert len(data) == starts[-1]
+    out = []
+    for i in range(n):
+        at = starts[0] + 9 * i
+        center = [int.from_bytes(data[at + 3 * k : at + 3 * k + 3], "little", signed=True) / (1 << bits) for k in range(3)]
+        alpha = data[starts[1] + i] / 255
+        colour = [(data[starts[2] + 3 * i + k] / 255 - 0.5) / 0.15 for k in range(3)]
+        scale = [math.exp(data[starts[3] + 3 * i + k] / 16 - 10) for k in range(3)]
+        word = int.from_bytes(data[starts[4] + 4 * i : starts[4] + 4 * i + 4], "little")
+        turn, largest = [0.0] * 4, word >> 30
+        for k in (k for k in (3, 2, 1, 0) if k != largest):
+            turn[k] = (-1 if word >> 9 & 1 else 1) * (word & 511) / 511 / math.sqrt(2)
+            word >>= 10
+        turn[largest] = math.sqrt(max(0.0, 1 - sum(x * x for x in turn)))
+        at = starts[5] + 3 * higher * i
+        out.append((center, alpha, colour, scale, turn, [(b - 128) / 128 for b in data[at : at + 3 * higher]]))
+    return [np.array(column) for column in zip(*out, strict=True)]
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_spz_holds_the_gaussians_at_the_start_state(degree, tmp_path):
+    asset, twin = with_splats("y", degree=degree)
+    center, alpha, colour, scale, turn, rest = read_spz(write_spz(asset, tmp_path))
+    want = pose(twin, 0.0)
+    order = torch.cat([torch.nonzero(twin.part_ids == link.part)[:, 0] for link in asset.links])
+    g, up = want[order], UPS["y"]
+    size = np.abs(0.5 * g.means.numpy()).max()
+    assert np.allclose(center, 0.5 * g.means.numpy() @ up.T, atol=size / 60_000)
+    assert np.allclose(alpha, torch.sigmoid(g.opacity_logits), atol=0.5 / 255 + 1e-6)
+    assert np.allclose(colour, g.sh[:, 0], atol=0.5 / 255 / 0.15 + 1e-6)
+    log_scales = g.log_scales.numpy() + math.log(0.5)
+    assert np.allclose(np.log(scale), np.clip(log_scales, -10, 5.9), atol=0.5 / 16 + 1e-6)
+    w, x, y, z = torch.nn.functional.normalize(g.quats, dim=-1).numpy().T
+    far = np.linalg.norm(matrix(turn) - up @ matrix(np.stack([x, y, z, w], 1)), axis=(1, 2))
+    assert far.max() < 0.006  # half a step of 1 / 722 in three components
+    if degree:
+        ways = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=-1).double()
+        sh = torch.from_numpy(np.concatenate([colour[:, None], rest.reshape(len(rest), -1, 3)], 1))
+        exact = evaluate(g.sh.double()[:, None], ways @ torch.from_numpy(up))
+        assert torch.allclose(evaluate(sh[:, None], ways), exact, atol=0.03)
+
+
+def test_another_reader_of_spz_agrees(tmp_path):
+    gsply = pytest.importorskip("gsply.spz", reason="gsply is not installed (pip install gsply)")
+    asset, _ = with_splats("y")
+    path = write_spz(asset, tmp_path)
+    center, alpha, colour, scale, turn, rest = read_spz(path)
+    got = gsply.read_spz(path)
+    assert np.allclose(got.means, center, atol=1e-6) and np.allclose(got.scales, np.log(scale), atol=1e-5)
+    assert np.allclose(1 / (1 + np.exp(-got.opacities)), alpha, atol=1e-5) and np.allclose(got.sh0, colour, atol=1e-5)
+    assert np.allclose(matrix(got.quats[:, [1, 2, 3, 0]]), matrix(turn), atol=1e-5)
+    assert np.allclose(got.shN.reshape(len(rest), -1), rest, atol=1e-6)
