@@ -106,6 +106,9 @@ def test_objects_and_settings_can_be_chosen(bench_file):
 def test_the_benches_that_come_with_p2gs_name_what_there_is(name):
     tree = yaml.safe_load((CONFIGS / "bench" / name).read_text())
     assert tree["name"] == Path(name).stem
+    if name == "zoo.yaml":  # scene folders of the user's own, of no benchmark
+        assert len(set(tree["objects"])) == len(tree["objects"]) == 48 and not tree.get("tables")
+        return
     columns = {o.column for o in pick_objects(tree["objects"] or [])}
     for table in map(paper_table, tree.get("tables", [])):
         assert set(tree["settings"]) & set(table.ours), table.name
