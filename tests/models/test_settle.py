@@ -65,15 +65,20 @@ def test_a_further_part_must_win_by_more(scene):
     assert scene("prismatic", slide(), [], [(other, "prismatic")], limit=1)[2] == []  # no more parts than allowed
 
 
-def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
-    """However much the surfaces gain by it."""
+def second_owns_the_panel(monkeypatch):
+    """Of a slide of one panel: states, labels, views, margins, and the slide a little off; a second part, once there is one, owns the panel."""
     states, labels, views = two_states(slide())
     margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.5)
     off = slide()
     off[:3, 3] += torch.tensor([0.0, 0.05, 0.0])
-    # once there is a second part, the moving panel is its
     monkeypatch.setattr(settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types)))
     monkeypatch.setattr(settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins))
+    return states, labels, views, margins, off
+
+
+def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
+    """However much the surfaces gain by it."""
+    states, labels, views, margins, off = second_owns_the_panel(monkeypatch)
     monkeypatch.setattr("p2gs.models.refine_motions.surface_energy", lambda found, T, types: -10.0 * len(types))
 
     def added(start, further):
@@ -85,12 +90,7 @@ def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
 
 
 def test_two_bodies_with_amounts_of_their_own_are_taken_where_the_energy_falls(monkeypatch):
-    states, labels, views = two_states(slide())
-    margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.5)
-    off = slide()
-    off[:3, 3] += torch.tensor([0.0, 0.05, 0.0])
-    monkeypatch.setattr(settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types)))
-    monkeypatch.setattr(settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins))
+    states, labels, views, margins, off = second_owns_the_panel(monkeypatch)
     monkeypatch.setattr(settle, "instead_of", lambda *a: [])
     monkeypatch.setattr(settle, "in_two", lambda found, T, types: [(0, torch.stack([T[0], slide()]), [*types, "prismatic"])])
     motions = PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], margins)

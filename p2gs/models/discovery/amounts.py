@@ -15,7 +15,7 @@ from torch import Tensor
 from p2gs.models.discovery.finish import snapped
 from p2gs.models.discovery.labels import Graph, Labelling, unary
 from p2gs.models.discovery.problem import Problem
-from p2gs.models.discovery.rigid import Motions
+from p2gs.models.discovery.rigid import Motions, without
 
 STEP = 1 / 3  # between amounts that are tried, tolerances across surfaces: a third of what tells two places apart
 STEPS = 200  # at most
@@ -46,7 +46,7 @@ def best_pair(problem: Problem, graphs: list[Graph], labelling: Labelling, motio
     A surfel costs what it does under the better of the two or under what else there is, averaged over its neighbours.
     """
     many = amounts_of(problem, axis, arm_of(problem, labelling, axis, k))
-    rest = motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
+    rest = without(motions, k)
     total = torch.zeros(len(many), len(many))
     for s in (0, 1):
         index = problem.moved[s].nonzero()[:, 0]

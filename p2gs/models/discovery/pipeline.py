@@ -20,7 +20,7 @@ from p2gs.models.discovery.labels import Graph, Labelling, label
 from p2gs.models.discovery.pool import plausibility
 from p2gs.models.discovery.problem import Problem, build_problem, resampled
 from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
-from p2gs.models.discovery.rigid import Motions
+from p2gs.models.discovery.rigid import Motions, without
 from p2gs.models.discovery.search import ExclusiveGain, Search, two_sided
 from p2gs.models.discovery.verify import image_score, violation
 from p2gs.ops import se3
@@ -276,11 +276,6 @@ def twins(problem: Problem, motions: Motions, labelling: Labelling) -> int | Non
 def touching(a: Tensor, b: Tensor, spacing: float) -> bool:
     """Do some of the surfels a [N, 3] lie as near to b [M, 3] as neighbours on one surface do?"""
     return bool((cKDTree(b.numpy()).query(a.numpy())[0] < 2 * spacing).sum() > 2)
-
-
-def without(motions: Motions, k: int) -> Motions:
-    """All motions but ``k``."""
-    return motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
 
 
 def masses(problem: Problem, labelling: Labelling) -> list[float]:

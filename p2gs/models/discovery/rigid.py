@@ -171,3 +171,8 @@ class Motions:
         """``swept`` in torch, point by point."""
         a, b = self.apply(points), other.apply(points)
         return (a[:, None] - b[None]).pow(2).sum(-1).mean(-1).sqrt()
+
+
+def without(motions: Motions, k: int) -> Motions:
+    """All motions but ``k``."""
+    return motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
