@@ -164,7 +164,7 @@ def _improved(judge: Judge, motions: PartMotions, limit: int, config: PartMotion
     motions, shifted = leave_false_minima(judge, motions, config.survey)
     if config.reconsider:
         say("reconsidering each part")
-        motions, reconsidered = reconsider(judge, motions, limit)
+        motions, reconsidered = reconsider(judge, motions, limit, config.candidates)
         changed += reconsidered
         motions = simplify(judge, motions, config.same_motion, changed)
     return motions, {"shifted": shifted, "reconsidered": changed}

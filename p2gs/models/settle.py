@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from p2gs.models.discovery import Candidate, Discovery, in_two, instead_of, relabel
+from p2gs.models.discovery import Candidate, Discovery, in_two, instead_of, places_changed, relabel
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.islands import settle_islands
 from p2gs.models.part_choices import settle_types, without_part
@@ -29,11 +29,13 @@ def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tup
     return labels, margin
 
 
-def reconsider(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMotions, list[dict]]:
-    """Exchange motions for others that explain what the refined rest leaves over, add one, or make one part two, while the energy falls.
+def reconsider(judge: Judge, motions: PartMotions, limit: int, render: int) -> tuple[PartMotions, list[dict]]:
+    """Exchange motions for others that explain what the refined rest leaves over, those of two like parts for such as change their ends, add
+    one, or make one part two, while the energy falls.
 
-    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), and for each part the two amounts about one
-    axis that explain most (``in_two``); under each proposal every surfel chooses its part anew and the states are re-rendered. The best of
+    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such as take each for the
+    other at the end (``places_changed``), and for each part the two amounts about one axis that explain most (``in_two``). Under each proposal
+    every surfel chooses its part anew, and with the ``render`` of each kind that surfaces like best the states are re-rendered. The best of
     each kind is refined, and the energy must fall; with a further part the image loss must as well (``judge.further``): what surfaces alone
     gain is junk.
     Returns the motions and what was tried.
@@ -42,18 +44,19 @@ def reconsider(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMoti
     lowest, cost = judge(motions)
     for _ in range(limit if len(motions) else 0):
         tries = {"exchanged": [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]}
+        tries["crossed"] = _proposed(found, states, motions, places_changed(found, motions.transforms, motions.types))
         if len(motions) < limit:
             tries["added"] = [(len(motions), m) for m in _with_part(found, states, motions, None)]
-            tries["parted"] = _parted(found, states, motions)
+            tries["parted"] = _proposed(found, states, motions, in_two(found, motions.transforms, motions.types))
         best = None
         for change, proposed in tries.items():
             if not proposed:
                 continue
-            values = [judge(m)[0] for _, m in proposed]
-            part, tried = proposed[values.index(min(values))]
+            proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[:render]
+            part, tried = min(proposed, key=lambda p: judge(p[1])[0])
             value, reached, refined = judge.improved(tried)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
-            log[-1] |= {"proposed": min(values) - lowest, "energy": value - lowest}
+            log[-1] |= {"proposed": judge(tried)[0] - lowest, "energy": value - lowest}
             junk = len(refined) > len(motions) and reached > cost * (1 - judge.further)
             if value < (lowest if best is None else best[0]) and not junk:
                 best = (value, reached, refined)
@@ -71,13 +74,13 @@ def _with_part(found: Discovery, states, motions: PartMotions, part: int | None)
     return out
 
 
-def _parted(found: Discovery, states, motions: PartMotions) -> list[tuple[int, PartMotions]]:
-    """Each part as two, labels chosen anew: (part, motions)."""
-    blank = torch.zeros(len(motions) + 1)
-    return [
-        (k, _relabelled(found, states, replace(motions, types=types, transforms=transforms, confidence=blank)))
-        for k, transforms, types in in_two(found, motions.transforms, motions.types)
-    ]
+def _proposed(found: Discovery, states, motions: PartMotions, proposals: list[tuple]) -> list[tuple[int, PartMotions]]:
+    """Of each (part, transforms, types) the part and the motions, labels chosen anew."""
+    out = []
+    for k, transforms, types in proposals:
+        tried = replace(motions, types=types, transforms=transforms, confidence=torch.zeros(len(types)))
+        out.append((k, _relabelled(found, states, tried)))
+    return out
 
 
 def _relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:

@@ -35,7 +35,7 @@ def scene(monkeypatch):
     def reconsider(kind, T, proposed, more=(), limit=1):
         monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: more if part is None else proposed)
         motions = PartMotions([kind], T[None], torch.ones(1), [labels, labels], margins)
-        return motions, *settle.reconsider(judge_of(states, views), motions, limit)
+        return motions, *settle.reconsider(judge_of(states, views), motions, limit, 3)
 
     return reconsider
 
@@ -66,7 +66,7 @@ def test_a_further_part_must_win_by_more(scene):
 
 
 def second_owns_the_panel(monkeypatch):
-    """Of a slide of one panel: states, labels, views, margins, and the slide a little off; a second part, once there is one, owns the panel."""
+    """States, labels, views and margins of one panel that slides, and its slide a little off; a second part, once there is one, owns it."""
     states, labels, views = two_states(slide())
     margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.5)
     off = slide()
@@ -84,7 +84,7 @@ def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
     def added(start, further):
         monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: [(further, "prismatic")] if part is None else [])
         motions = PartMotions(["prismatic"], start[None], torch.ones(1), [labels, labels], margins)
-        return len(settle.reconsider(judge_of(states, views), motions, 2)[0])
+        return len(settle.reconsider(judge_of(states, views), motions, 2, 3)[0])
 
     assert added(off, slide()) == 2 and added(slide(), -off + 2 * torch.eye(4).double()) == 1
 
@@ -96,7 +96,7 @@ def test_two_bodies_with_amounts_of_their_own_are_taken_where_the_energy_falls(m
     motions = PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], margins)
     for price, parts in ((0.01, 2), (9.0, 1)):
         monkeypatch.setattr("p2gs.models.refine_motions.surface_energy", lambda found, T, types, price=price: price * len(types))
-        found, log = settle.reconsider(judge_of(states, views), motions, 2)
+        found, log = settle.reconsider(judge_of(states, views), motions, 2, 3)
         assert len(found) == parts and log[0]["change"] == "parted"
 
 

@@ -17,6 +17,7 @@ from p2gs.models.discovery.evidence import StateEvidence
 from p2gs.models.discovery.finish import Explanation, settle_parts
 from p2gs.models.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.models.discovery.labels import Graph, Labelling, label
+from p2gs.models.discovery.pairs import crossed
 from p2gs.models.discovery.pool import plausibility
 from p2gs.models.discovery.problem import Problem, build_problem, resampled
 from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
@@ -161,9 +162,21 @@ def in_two(found: Discovery, transforms: Tensor, types: list[str]) -> list[tuple
     return out
 
 
+def places_changed(found: Discovery, transforms: Tensor, types: list[str], count: int = 3) -> list[tuple[int, Tensor, list[str]]]:
+    """Two parts each with the other's end for its own, for the ``count`` pairs that explain most so: (one of them, motions [K, 4, 4], types)."""
+    if found.search is None or len(types) < 2:
+        return []
+    own = sided(found.problem, as_motions(transforms, types))
+    out = []
+    for k, more in crossed(found.search, label(found.problem, own, found.graphs), own, count):
+        kinds = ["revolute" if bool(t) else "prismatic" for t in more.turn]
+        out.append((k, torch.stack([more.transform(i) for i in range(len(more))]), kinds))
+    return out
+
+
 def sided(problem: Problem, motions: Motions) -> Motions:
     """The motions with the thickness of plate under which most of the moved surface arrives."""
-    return two_sided(problem, motions, ExclusiveGain(problem, problem.samples, [torch.ones(len(s)) for s in problem.samples]))
+    return two_sided(problem, motions, ExclusiveGain(problem, problem.samples, problem.weights))
 
 
 def as_motions(transforms: Tensor, types: list[str]) -> Motions:
