@@ -132,7 +132,7 @@ def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say)
     if len(explanations) <= config.candidates:
         return explanations, []
     say(f"a quick look at {len(explanations)} explanations")
-    quick = replace(judge, config=replace(config.coarse, steps=config.look_steps, levels=config.coarse.levels[:1], level_starts=[0.0]))
+    quick = judge.at_a_glance(config.look_steps)
     looks = [quick(quick.refine(_label_states(e, judge.states)))[0] for e in explanations]
     order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
     return [explanations[i] for i in order], looks
@@ -164,7 +164,7 @@ def _improved(judge: Judge, motions: PartMotions, limit: int, config: PartMotion
     motions, shifted = leave_false_minima(judge, motions, config.survey)
     if config.reconsider:
         say("reconsidering each part")
-        motions, reconsidered = reconsider(judge, motions, limit, config.candidates)
+        motions, reconsidered = reconsider(judge, motions, limit, config)
         changed += reconsidered
         motions = simplify(judge, motions, config.same_motion, changed)
     return motions, {"shifted": shifted, "reconsidered": changed}
