@@ -5,7 +5,7 @@ Not a training phase of the paper: its ancestors need hand-made part centres or 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
