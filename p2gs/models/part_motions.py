@@ -148,7 +148,7 @@ def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) 
         reductions: list[dict] = []
         motions = simplify(judge, judge.improved(motions)[2], config.same_motion, reductions)
         rank, cost = judge(motions)
-        tried.append({"types": motions.types, "cost": cost, "rank": rank, "value": explanation.value, "reductions": reductions})
+        tried.append({"types": motions.types, "cost": cost, "rank": rank, "reductions": reductions})
         refined.append((rank, number, motions))
     _, number, motions = min(refined, key=lambda t: t[:2])
     return motions, {"explanation": number, "explanations": tried}
