@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from ladder import Case, runs_parser
+from ladder import Case, runs_parser, to_training
 from scipy.optimize import minimize
 
 from p2gs.models import handover
@@ -28,9 +28,10 @@ from p2gs.models.discovery.search import Search
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.finish import FinishRecord, measure
 from p2gs.models.handover import PartMotions
-from p2gs.models.joint_confidence import JointEvidence, common_level, features, state_depth
+from p2gs.models.joint_confidence import JointEvidence, common_level, features, nudges, state_depth
 from p2gs.models.refine_motions import refine, single_ways
 from p2gs.models.settle import label_gaussians
+from p2gs.ops import se3
 
 
 def searched(case: Case) -> SimpleNamespace:
@@ -47,9 +48,9 @@ def searched(case: Case) -> SimpleNamespace:
     return SimpleNamespace(problem=problem, graphs=[Graph(s.points, s.normals, s.colours) for s in problem.surfels], search=search)
 
 
-def considered(case: Case, found: SimpleNamespace, own: PartMotions, sets: int) -> list[tuple[torch.Tensor, list[str]]]:
-    """The run's own motions, then sets that the search likes: complete ones, and its own with one exchanged."""
-    out = [(own.transforms, own.types)]
+def considered(found: SimpleNamespace, own: PartMotions, sets: int) -> list[tuple[torch.Tensor, list[str]]]:
+    """Sets of motions that the search likes: complete ones, and the run's own with one exchanged."""
+    out = []
     for _, chosen in found.search.solve()[:sets]:
         m = found.search.pool.motions[torch.tensor(chosen)]
         out.append((torch.stack([m.transform(k) for k in range(len(m))]), ["revolute" if bool(t) else "prismatic" for t in m.turn]))
@@ -60,20 +61,53 @@ def considered(case: Case, found: SimpleNamespace, own: PartMotions, sets: int) 
     return out
 
 
-def measured(case: Case, found, states, stacks, level: int, transforms: torch.Tensor, types: list[str]) -> list[dict]:
-    """Each joint's measures after the last stage's refinement, and whether it is right."""
+def displaced(case: Case, own: PartMotions, sizes=(0.02, 0.06)) -> list[tuple[torch.Tensor, list[str]]]:
+    """The run's own motions with each part off by ``sizes`` (internal units), every part in another of its freedoms: wrong joints
+    that nothing has refined."""
+    out = []
+    points = [case.states[0].gaussians.means[own.labels[0] == k + 1].double() for k in range(len(own))]
+    for number, size in enumerate(sizes):
+        changed = own.transforms.clone()
+        for k, (kind, at) in enumerate(zip(own.types, points, strict=True)):
+            if len(at):
+                radius = max(float((at - at.mean(0)).square().sum(1).mean().sqrt()), 1e-3)
+                pairs = nudges(kind, own.transforms[k], se3.apply(own.transforms[k], at.mean(0)[None])[0], radius, size)
+                changed[k] = pairs[(k + number) % len(pairs)][number % 2]
+        out.append((changed, own.types))
+    return out
+
+
+def measured(case: Case, found, states, stacks, level: int, transforms: torch.Tensor, types: list[str], refined: bool) -> list[dict]:
+    """Each joint's measures, after the last stage's refinement if ``refined``, and whether it is right."""
     config, views = case.cfg.phases["finish"].config, case.pipeline.views
     options = {"backend": case.cfg.rasterizer, "device": case.pipeline.device}
     explanation = relabel(found, transforms, types)
     labels, margin = label_gaussians(explanation, states)
     motions = PartMotions(types, transforms, torch.zeros(len(types)), labels, margin)
-    motions = refine(states, motions, views, config.polish, stacks, seed=case.cfg.seed, **options)
+    if refined:
+        motions = refine(states, motions, views, config.polish, stacks, seed=case.cfg.seed, **options)
     record = FinishRecord(labels, [m.sign() for m in margin], motions.transforms, motions.transforms)
     record.polish = single_ways(states, motions, views, config.polish, stacks, seed=case.cfg.seed, **options)
     measure(record, states, types, views, stacks, level, **options)
-    score = case.score(motions.transforms, types)
-    right = {row["pred"] for row in score["joints"] if row["right"]}
-    return [{"right": k in right, "type": types[k], **e.as_dict()} for k, e in enumerate(record.evidence)]
+    return judged(case, motions.transforms, types, [e.as_dict() for e in record.evidence])
+
+
+def judged(case: Case, transforms: torch.Tensor, types: list[str], measures: list[dict]) -> list[dict]:
+    """The measures of each joint, and whether it is right."""
+    right = {row["pred"] for row in case.score(transforms, types)["joints"] if row["right"]}
+    return [{"right": k in right, "type": types[k], **m} for k, m in enumerate(measures)]
+
+
+def own_joints(case: Case, run: Path) -> list[dict]:
+    """The joints of the run's twin as its last stage measured them."""
+    joints = [p["joint"] for p in json.loads((run / "twin.json").read_text())["parts"][1:]]
+    if not joints:
+        return []
+    transforms = torch.stack([to_training(torch.tensor(j["transform"], dtype=torch.float64), case.similarity) for j in joints])
+    measures = json.loads((run / "diagnostics.json").read_text())["joints"]
+    for m in measures:
+        m["disagreement"] *= case.similarity.scale  # the file's is in the scene's units
+    return judged(case, transforms, [j["type"] for j in joints], measures)
 
 
 def gather(run: Path, zoo: Path, sets: int, out: Path) -> None:
@@ -84,13 +118,15 @@ def gather(run: Path, zoo: Path, sets: int, out: Path) -> None:
     states = [handover.load(run / "checkpoints" / f"sharpen_{s}.pt")[0] for s in (0, 1)]
     level = common_level(case.pipeline.views)
     stacks = [state_depth(s, case.pipeline.views[i], level, backend=case.cfg.rasterizer) for i, s in enumerate(states)]
-    for number, (T, types) in enumerate(considered(case, found, own, sets)):
-        for row in measured(case, found, states, stacks, level, T, types):
-            with out.open("a") as f:
-                f.write(json.dumps({"name": case.name, "set": number, **row}) + "\n")
+    rows = own_joints(case, run)
+    for refined, proposals in ((True, considered(found, own, sets)), (False, displaced(case, own))):
+        for T, types in proposals:
+            rows += measured(case, found, states, stacks, level, T, types, refined)
+    with out.open("a") as f:
+        f.writelines(json.dumps({"name": case.name, **row}) + "\n" for row in rows)
 
 
-def fitted(x: np.ndarray, right: np.ndarray, weight: np.ndarray, damping: float = 0.01) -> np.ndarray:
+def fitted(x: np.ndarray, right: np.ndarray, weight: np.ndarray, damping: float = 0.001) -> np.ndarray:
     """Weights [F + 1] of features [N, F], no one negative, the constant last: logistic regression with a little damping."""
 
     def loss(w):
@@ -125,7 +161,7 @@ def main() -> None:
     if "--fit" in sys.argv:
         return fit(Path(sys.argv[sys.argv.index("--fit") + 1]))
     parser = runs_parser(__doc__.splitlines()[0])
-    parser.add_argument("--sets", type=int, default=3, help="sets of motions that the search likes, besides the run's own")
+    parser.add_argument("--sets", type=int, default=3, help="sets of motions that the search likes, besides the run's own joints")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     for run in args.runs:

@@ -82,7 +82,8 @@ def diagnose(
     }
     for part, evidence in zip(twin.parts[1:], record.evidence, strict=True):
         row = {"part": part.id, "type": part.joint.type} | evidence.as_dict()
-        row["disagreement"] *= unit
+        if row["disagreement"] is not None:
+            row["disagreement"] *= unit
         d["joints"].append(row)
     for row, slot, earlier in zip(d["joints"], record.slots, trace(states, motions, record, views, stacks, coarse, render), strict=True):
         row |= {"slot": slot, "confidence_by_stage": {**earlier, "finish": row["confidence"]}}

@@ -22,8 +22,7 @@ LIMITS = {
     "residual": (4.0, "image residual of a moved part, as a multiple of the static part's"),
     "rise": (0.005, "growth of the residual when a part is displaced by 1 % of the diagonal: below, images do not hold the joint"),
     "fall": (0.03, "share by which a small change of the joint lowers the residual: the joint is not at its best place"),
-    "confidence": (0.1, "confidence below which a joint should not be used"),
-    "sure": (0.3, "confidence below which a joint deserves a look at its pictures"),
+    "confidence": (0.5, "confidence below which a joint is more likely wrong than right"),
 }
 STAGES = ("single_state", "discovery", "canonical_fusion", "articulation", "finish")
 
@@ -161,12 +160,12 @@ def _joints(d: dict, say, diagonal: float) -> None:
             reasons.append("the images hardly hold it: a small displacement does not make them worse")
         if j["fall"] > limit("fall"):
             reasons.append(f"a small change of the joint makes the images {j['fall']:.0%} better")
-        why = "; ".join(reasons) or "several measures are middling"
+        why = "; ".join(reasons) or "several measures together speak against it"
         if j["confidence"] < limit("confidence"):
             text = f"{name} ({j['type']}): {why}; its motion is not reliable (confidence {j['confidence']:.2f})"
             earlier = j["confidence_by_stage"]
             if "discovery" in earlier:
                 text += f"; discovery handed it over with {earlier['discovery']:.2f}, articulation with {earlier['articulation']:.2f}"
             say(next(s for s, c in earlier.items() if c < limit("confidence")), text + ".")
-        elif reasons or j["confidence"] < limit("sure"):
+        elif reasons:
             say("finish", f"{name} ({j['type']}): {why} (confidence {j['confidence']:.2f}).", "note")

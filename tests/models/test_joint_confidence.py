@@ -51,8 +51,7 @@ def door():
 def test_confidence_of_a_hinge_falls_with_its_error(door, tilt):
     found = [evidence(*door, turned(hinge(), d, tilt), "revolute") for d in (0.0, 1.0, 2.5, 5.0, 10.0)]
     values = [e.confidence for e in found]
-    assert values[0] > 0.8 and values[3] < 0.4 and values[4] < 0.1, values
-    values = [max(v, 0.01) for v in values]  # far from the right motion there is nothing left to order
+    assert values[0] > 0.9 and max(values[3:]) < 0.6, values  # without two directions to compare
     assert values == sorted(values, reverse=True), values
     assert found[0].fall < 0.02 < found[3].fall
 
@@ -64,7 +63,7 @@ def test_confidence_of_a_slide_falls_with_its_error():
         T = slide()
         T[0, 3] += miss
         values.append(evidence(states, labels, views, T, "prismatic").confidence)
-    assert values[0] > 0.8 and values[2] < 0.4 and values == sorted(values, reverse=True), values
+    assert values[0] > 0.9 and values[1] < 0.6 and values == sorted(values, reverse=True), values
 
 
 def test_half_the_support_removed(door):
@@ -78,7 +77,7 @@ def test_half_the_support_removed(door):
     (found,) = measure_joints([states[0], rest], [labels, kept], hinge()[None], ["revolute"], half, stacks, level=SIZE)
     whole = evidence(*door, hinge(), "revolute")
     assert 0.3 < found.contradicted < 0.7 and whole.contradicted < 0.05
-    assert found.confidence < 0.6 * whole.confidence
+    assert found.confidence < whole.confidence - 0.1
 
 
 def test_directions_that_disagree(door):
@@ -86,7 +85,7 @@ def test_directions_that_disagree(door):
     for degrees in (0.0, 1.0, 3.0):
         both = [hinge()[None], turned(hinge(), degrees)[None]]
         values.append(evidence(*door, hinge(), "revolute", both).confidence)
-    assert values[0] > values[1] > values[2] and values[2] < 0.7 * values[0], values
+    assert values[0] > values[1] > values[2], values
 
 
 def test_landing_tells_surface_from_free_space(door):
@@ -119,11 +118,15 @@ def test_a_part_that_no_photograph_shows_has_no_confidence(door):
     assert found.views == 0 and found.confidence == 0.0
 
 
-def test_factors():
-    clean = JointEvidence(coverage=0.5, contradicted=0.0, residual=0.9, rise=1.0, fall=0.0, disagreement=0.0, views=4)
-    assert clean.confidence == pytest.approx(1.0, abs=1e-3)
-    half = {"coverage": 0.25, "contradicted": 0.5, "residual": 5.0, "rise": 0.01, "fall": 0.04, "disagreement": 0.02}
-    for name, worse in half.items():
-        changed = replace(clean, **{name: worse})
-        assert changed.confidence == pytest.approx(0.5, abs=0.01), name
+def test_confidence_is_a_probability_that_falls_with_each_measure():
+    clean = JointEvidence(coverage=0.9, contradicted=0.0, residual=1.0, rise=0.1, fall=0.0, disagreement=0.001, views=4)
+    assert 0.9 < clean.confidence < 1
+    for name, values in {"contradicted": (0.2, 0.6), "rise": (0.03, 0.01), "fall": (0.05, 0.09), "disagreement": (0.01, 0.05)}.items():
+        found = [clean.confidence, *(replace(clean, **{name: v}).confidence for v in values)]
+        assert found == sorted(found, reverse=True) and len(set(found)) == 3, name
+    worst = replace(clean, contradicted=0.5, rise=0.0, fall=0.1, disagreement=0.05)
+    assert worst.confidence < 0.1 and replace(clean, views=0).confidence == 0
+
+
+def test_size_of_the_photographs_that_joints_are_measured_in():
     assert measuring_level(TrainingViews([], [100, 400])) == 100 and measuring_level(TrainingViews([], [300])) == 300
