@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from p2gs.data.base import Visit
 from p2gs.losses.base import Loss, LossInputs, PartState
 from p2gs.models.canonical import carry
 from p2gs.models.context import RunContext
@@ -172,9 +173,9 @@ class ArticulationPhase(ImagePhase):
         return exponential(self.config.temperature, self.config.temperature_end, fraction)
 
     # -- one step -------------------------------------------------------------------------------------------------------------
-    def inputs(self, step: int) -> LossInputs:
-        state = step % 2
-        camera, target = self.target(step // 2, state)
+    def inputs(self, visit: Visit) -> LossInputs:
+        step, state = visit.step, visit.state
+        camera, target = self.target(visit)
         g = self.splats.tensors()
         probs = self.head(self.splats.psi, self.temperature(step))
         moved = blend_move(g, probs, self.screws.twists(state - self.times))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from p2gs.data.base import Visit
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.canonical import CanonicalConfig, fuse, keep_rows, with_static
 from p2gs.models.context import RunContext
@@ -120,13 +121,10 @@ class CanonicalFusionPhase(ImagePhase):
             self.moves = [RigidMoves(self.splats.labels, se3.screw_at(self.transforms, s - (1 - self.betas[1:]))) for s in (0, 1)]
         return g.placed(*self.moves[state](g.means, g.quats))
 
-    def inputs(self, step: int) -> LossInputs:
-        state = step % 2
-        camera, target = self.target(step // 2, state)
-        g = self.posed(state)
-        return LossInputs(
-            step, self.total_steps, self.splats.tensors(), self.render(g, camera, target.background), target, camera, cache=self.loss_cache
-        )
+    def inputs(self, visit: Visit) -> LossInputs:
+        camera, target = self.target(visit)
+        render = self.render(self.posed(visit.state), camera, target.background)
+        return LossInputs(visit.step, self.total_steps, self.splats.tensors(), render, target, camera, cache=self.loss_cache)
 
     def hand_over(self) -> CanonicalGaussians:
         s = self.splats
