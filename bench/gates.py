@@ -20,7 +20,7 @@ from p2gs.models.discovery.labels import Graph
 from p2gs.models.discovery.problem import build_problem
 from p2gs.models.evidence import gather_evidence
 from p2gs.models.handover import PartMotions
-from p2gs.models.refine_motions import energy, explanation_cost, refine
+from p2gs.models.refine_motions import Judge
 from p2gs.models.settle import label_gaussians
 from p2gs.ops import se3
 
@@ -70,16 +70,16 @@ def gates(case: Case, search: bool) -> dict:
     else:
         problem = build_problem(*seen, config.search, case.cfg.seed)[0]
         found = SimpleNamespace(problem=problem, graphs=[Graph(s.points, s.normals, s.colours) for s in problem.surfels])
-    stacks = found.problem.stacks
+    judge = Judge(found, case.states, views, config.coarse, found.problem.stacks, seed=case.cfg.seed, **options)
     motions = labelled(case, found, truth, types)
-    refined = refine(case.states, motions, views, config.coarse, stacks, seed=case.cfg.seed, **options)
+    refined = judge.refine(motions)
     row: dict = {"name": case.name, "left": left(case, refined, truth)}
     if search:
         best = case.discover()[0]
         asked = {"truth": motions, "truth, refined": refined, "found": best}
         for name, m in asked.items():
-            loss = explanation_cost(case.states, m, views, config.coarse, stacks, **options)
-            row[name] = {"loss": round(loss, 4), "energy": round(energy(found, m, loss), 4)}
+            value, loss = judge(m)
+            row[name] = {"loss": round(loss, 4), "energy": round(value, 4)}
         row |= case.score(best.transforms, best.types)
     return row
 

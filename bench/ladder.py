@@ -16,12 +16,14 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import torch
 import yaml
+from scipy.optimize import linear_sum_assignment
 
 from p2gs.config import load_config
 from p2gs.data.ground_truth import load_ground_truth
-from p2gs.metrics.joints import joint_errors
+from p2gs.metrics.joints import joint_errors, match_joints
 from p2gs.metrics.modules import JointError
 from p2gs.models import handover
 from p2gs.models.part_motions import find_part_motions
@@ -58,9 +60,9 @@ def ties_of(name: str, zoo: Path) -> dict[str, list[float]]:
     return {joint: [float(x) for x in other.split(",")] for scene, joint, _, other in lines if scene == name}
 
 
-def is_right(score, gt, pred, others: list[float]) -> bool:
+def is_right(gt, pred, others: list[float]) -> bool:
     """Within ``RIGHT`` of the true joint, or of one with another turn that no picture tells from it."""
-    if score.failed:
+    if gt.type != pred.type:
         return False
     for motion in [gt.motion, *others]:
         e = joint_errors(pred, SimpleNamespace(type=gt.type, axis=gt.axis, origin=gt.origin, motion=motion))
@@ -68,6 +70,16 @@ def is_right(score, gt, pred, others: list[float]) -> bool:
         if e.axis_angle <= RIGHT["axis_angle"] and (e.axis_position or 0) <= RIGHT["axis_position"] and e.motion <= bound:
             return True
     return False
+
+
+def paired(found: list, truth: list, right: np.ndarray) -> dict[int, int]:
+    """True joint -> found joint: as many as can be of those that are ``right`` [truth, found], the others as the metrics pair them.
+    Two crosses of a tap may turn about one line, and what is a tie for one is then the other's turn to the metrics."""
+    rows, columns = linear_sum_assignment(right, maximize=True)
+    pairs = {int(i): int(j) for i, j in zip(rows, columns, strict=True) if right[i, j]}
+    rest = [[i for i in range(len(of)) if i not in used] for of, used in ((truth, pairs.keys()), (found, pairs.values()))]
+    left = match_joints([found[j] for j in rest[1]], [truth[i] for i in rest[0]])
+    return pairs | {rest[0][i]: rest[1][j] for i, j in left.items()}
 
 
 class Case:
@@ -91,19 +103,21 @@ class Case:
     def score(self, transforms: torch.Tensor, types: list[str]) -> dict:
         """Each true joint's errors and whether it is right; how many parts are too many."""
         found = [joint_of(to_input(T.double(), self.similarity), kind) for T, kind in zip(transforms, types, strict=True)]
+        truth = self.truth.joints
+        others = [self.ties.get(name, []) for name in self.joints] or [[] for _ in truth]
+        right = np.array([[is_right(gt, p, o) for p in found] for gt, o in zip(truth, others, strict=True)]).reshape(len(truth), len(found))
         metric = JointError()
-        metric.update(found, self.truth.joints)
+        metric.update(found, truth, paired(found, truth, right))
         report = metric.report
         rows = []
         for s in report.joints:
-            others = self.ties.get(self.joints[s.gt], []) if self.joints else []
-            right = is_right(s, self.truth.joints[s.gt], found[s.pred] if s.pred is not None else None, others)
             e = s.errors
             errors = None
             if e is not None:
                 position = None if e.axis_position is None else round(e.axis_position, 3)
                 errors = [round(e.axis_angle, 3), position, round(e.motion, 4)]
-            rows.append({"joint": s.gt, "type": s.type, "pred": s.pred, "right": right, "errors": errors})
+            good = s.pred is not None and bool(right[s.gt, s.pred])
+            rows.append({"joint": s.gt, "type": s.type, "pred": s.pred, "right": good, "errors": errors})
         return {"right": sum(r["right"] for r in rows), "of": len(rows), "extra": len(report.extra), "joints": rows}
 
     def discover(self, report=None):

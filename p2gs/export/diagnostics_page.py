@@ -137,12 +137,17 @@ def _discovery(d: dict) -> list[str]:
             tried = e.get("reductions", [])
             gone = ", ".join(f"{r['change']} {r['type']} ({r['cost_with']:.4f} to {r['cost_without']:.4f})" for r in tried)
             mark = "chosen" if i == found["chosen"] else ""
-            rows.append([str(i + 1), f"{e['cost']:.4f}", f"{e['rank']:.3f}", mark, f"{', '.join(e.get('types', []))}{'; ' * bool(gone)}{gone}"])
-        out.append(table(["explanation", "image loss", "energy", "", "parts; what was dropped or merged (image loss with it, without it)"], rows))
-        tried = [t for t in found.get("reconsidered", []) if "energy" in t and "after" in t]
+            rows.append(
+                [str(i + 1), f"{e['cost']:.4f}", f"{e['rank']:.3f}", mark, f"{', '.join(e.get('types', []))}{'; ' * bool(gone)}{gone}"]
+            )
+        out.append(
+            table(["explanation", "image loss", "energy", "", "parts; what was dropped or merged (image loss with it, without it)"], rows)
+        )
+        tried = [t for t in found.get("reconsidered", []) if "glance" in t]
         if tried:
-            rows = [[t["change"], t["type"], f"{t['cost']:.4f}", f"{t['after']:.4f}", f"{t['energy']:+.4f}"] for t in tried]
-            out.append(table(["tried on the chosen one", "type", "image loss", "with it", "energy"], rows))
+            refined = [[f"{t['after']:.4f}", f"{t['energy']:+.4f}"] if "after" in t else ["", ""] for t in tried]
+            rows = [[t["change"], t["type"], f"{t['cost']:.4f}", f"{t['glance']:+.4f}", *r] for t, r in zip(tried, refined, strict=True)]
+            out.append(table(["tried on the chosen one", "type", "image loss", "energy at a glance", "image loss with it", "energy"], rows))
         rows = [[f"{p['part']}", p["type"], _amount(p), f"{p['confidence']:.2f}"] for p in found["parts"]]
         out.append(table(["part of discovery", "type", "start to end", "share explained"], rows))
     rows = [

@@ -6,6 +6,7 @@ worse after any small change of the joint, and the two directions should tell th
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 
 import torch
@@ -62,6 +63,16 @@ class JointEvidence:
     def as_dict(self) -> dict:
         """For JSON."""
         return {**asdict(self), "confidence": self.confidence}
+
+
+def features(e: JointEvidence) -> list[float]:
+    """What speaks for a joint, each the more the better: coverage, what nothing contradicts, how near its residual is to the static part's,
+    how much the residual rises and how little it falls when the joint is displaced, how well both directions agree. Residual, rise and
+    disagreement as logarithms: they span decades."""
+    if e.views == 0:
+        return [0.0, 0.0, -5.0, -8.0, -1.0, -2.0]
+    residual, rise = math.log(max(e.residual, 1.0)), math.log(max(e.rise, 3e-4))
+    return [e.coverage, -e.contradicted, -residual, rise, -max(e.fall, 0.0), -math.log(max(e.disagreement, 3e-4))]
 
 
 def soft(x: float, half: float) -> float:

@@ -5,7 +5,7 @@ Not a training phase of the paper: its ancestors need hand-made part centres or 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -28,8 +28,8 @@ class PartMotionsConfig:
     """Options of part discovery.
 
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
-    candidates: how many complete explanations are compared by re-rendering; of more, those that look best after ``look_steps`` of
-    refinement at the smallest size.
+    candidates: how many complete explanations, and later changes of one kind, are compared by re-rendering; of more explanations those that
+    look best at a glance, after ``look_steps`` of refinement at the smallest size.
     coarse: photometric refinement right after discovery.
     compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
     freedom_penalty: relative image loss by which a turn must win against a slide.
@@ -39,8 +39,8 @@ class PartMotionsConfig:
     by saves half of this, the second of two stacked doors three times.
     islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
     (0 = off).  rounds: how often labels, types and motions are settled anew.
-    reconsider: each part's motion, one more, and each part as two are searched again amid the others, refined, and taken where the
-    energy falls.
+    reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched again amid the others,
+    refined where a glance finds them better, and taken where the energy falls.
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
 
@@ -132,7 +132,7 @@ def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say)
     if len(explanations) <= config.candidates:
         return explanations, []
     say(f"a quick look at {len(explanations)} explanations")
-    quick = replace(judge, config=replace(config.coarse, steps=config.look_steps, levels=config.coarse.levels[:1], level_starts=[0.0]))
+    quick = judge.at_a_glance(config.look_steps)
     looks = [quick(quick.refine(_label_states(e, judge.states)))[0] for e in explanations]
     order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
     return [explanations[i] for i in order], looks
@@ -148,7 +148,7 @@ def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) 
         reductions: list[dict] = []
         motions = simplify(judge, judge.improved(motions)[2], config.same_motion, reductions)
         rank, cost = judge(motions)
-        tried.append({"types": motions.types, "cost": cost, "rank": rank, "value": explanation.value, "reductions": reductions})
+        tried.append({"types": motions.types, "cost": cost, "rank": rank, "reductions": reductions})
         refined.append((rank, number, motions))
     _, number, motions = min(refined, key=lambda t: t[:2])
     return motions, {"explanation": number, "explanations": tried}
@@ -164,7 +164,7 @@ def _improved(judge: Judge, motions: PartMotions, limit: int, config: PartMotion
     motions, shifted = leave_false_minima(judge, motions, config.survey)
     if config.reconsider:
         say("reconsidering each part")
-        motions, reconsidered = reconsider(judge, motions, limit)
+        motions, reconsidered = reconsider(judge, motions, limit, config)
         changed += reconsidered
         motions = simplify(judge, motions, config.same_motion, changed)
     return motions, {"shifted": shifted, "reconsidered": changed}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Callable
 
 import torch
 from torch import Tensor
@@ -19,6 +21,7 @@ from p2gs.ops import se3
 # What a pixel costs that the other state hides: as much of the loss of one without any likeness (1 of 1 - SSIM, weighted 0.8) as landing in
 # hidden space costs of landing in free space.
 HIDDEN = 0.8 * Landing.HIDDEN
+KNOWN = 64  # answers of a ``Judge`` that are kept
 
 
 def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor:
@@ -88,17 +91,11 @@ def explanation_cost(
     return 0.5 * total
 
 
-def energy(found: Discovery | None, motions: PartMotions, loss: float) -> float:
-    """One number by which explanations are compared, lower is better: the logarithm of the image loss (``explanation_cost``) plus what the
-    surfaces say (``surface_energy``). Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left unexplained.
-    Without ``found`` photographs alone speak."""
-    surfaces = 0.0 if found is None else surface_energy(found, motions.transforms, motions.types)
-    return math.log(max(loss, 1e-9)) + surfaces
-
-
 @dataclass
 class Judge:
-    """By what explanations are compared and refined.
+    """By what explanations are compared and refined: one number, the logarithm of the image loss (``explanation_cost``) plus what the surfaces
+    say (``surface_energy``); lower is better. Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left
+    unexplained.
 
     found: discovery's problem (None: photographs alone).  stacks: rendered depth of both states.  further: share of the image loss that a
     further part must save.
@@ -113,16 +110,36 @@ class Judge:
     backend: str
     device: torch.device | str = "cpu"
     further: float = 0.0
+    known: list[tuple] = field(default_factory=list, init=False)  # the latest motions, what was asked of them, the answer
+
+    def _asked(self, motions: PartMotions, what: str, answer: Callable[[], float]) -> float:
+        """``answer()``, or what it was the last time for the same motions."""
+        for m, name, value in self.known:
+            if m is motions and name == what:
+                return value
+        self.known = [*self.known[-KNOWN:], (motions, what, answer())]
+        return self.known[-1][2]
+
+    def at_a_glance(self, steps: int) -> Judge:
+        """The same by the smallest photographs, refining in fewer steps."""
+        return replace(self, config=replace(self.config, steps=steps, levels=self.config.levels[:1], level_starts=[0.0]))
 
     def cost(self, motions: PartMotions) -> float:
         """Image loss (``explanation_cost``)."""
         options = {"backend": self.backend, "device": self.device}
-        return explanation_cost(self.states, motions, self.views, self.config, self.stacks, **options)
+        ask = partial(explanation_cost, self.states, motions, self.views, self.config, self.stacks, **options)
+        return self._asked(motions, "cost", ask)
+
+    def surfaces(self, motions: PartMotions) -> float:
+        """What the surfaces say (``surface_energy``); nothing without ``found``."""
+        if self.found is None:
+            return 0.0
+        return self._asked(motions, "surfaces", partial(surface_energy, self.found, motions.transforms, motions.types))
 
     def __call__(self, motions: PartMotions) -> tuple[float, float]:
         """Energy and image loss."""
         cost = self.cost(motions)
-        return energy(self.found, motions, cost), cost
+        return math.log(max(cost, 1e-9)) + self.surfaces(motions), cost
 
     def refine(self, motions: PartMotions) -> PartMotions:
         """Refined by the photographs, whether or not the energy falls."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from p2gs.models.discovery import Candidate, Discovery, in_two, instead_of, relabel
+from p2gs.models.discovery import Candidate, Discovery, in_two, instead_of, places_changed, relabel
 from p2gs.models.handover import PartMotions, StateGaussians
 from p2gs.models.islands import settle_islands
 from p2gs.models.part_choices import settle_types, without_part
@@ -29,31 +29,38 @@ def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tup
     return labels, margin
 
 
-def reconsider(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMotions, list[dict]]:
-    """Exchange motions for others that explain what the refined rest leaves over, add one, or make one part two, while the energy falls.
+def reconsider(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:
+    """Exchange motions for others that explain what the refined rest leaves over, those of two like parts for such as change their ends, add
+    one, or make one part two, while the energy falls.
 
-    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), and for each part the two amounts about one
-    axis that explain most (``in_two``); under each proposal every surfel chooses its part anew and the states are re-rendered. The best of
-    each kind is refined, and the energy must fall; with a further part the image loss must as well (``judge.further``): what surfaces alone
-    gain is junk.
+    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such as take each for the
+    other at the end (``places_changed``), and for each part the two amounts about one axis that explain most (``in_two``). Under each proposal
+    every surfel chooses its part anew, and with the ``candidates`` of each kind that surfaces like best the states are re-rendered. The best
+    of each kind is looked at (``look_steps``), and what looks better than the motions as they are is refined: the energy must fall; with a
+    further part the image loss must as well (``judge.further``): what surfaces alone gain is junk.
     Returns the motions and what was tried.
     """
     found, states, log = judge.found, judge.states, []
     lowest, cost = judge(motions)
+    quick = judge.at_a_glance(config.look_steps)
     for _ in range(limit if len(motions) else 0):
         tries = {"exchanged": [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]}
+        tries["crossed"] = _proposed(found, states, motions, places_changed(found, motions.transforms, motions.types))
         if len(motions) < limit:
             tries["added"] = [(len(motions), m) for m in _with_part(found, states, motions, None)]
-            tries["parted"] = _parted(found, states, motions)
+            tries["parted"] = _proposed(found, states, motions, in_two(found, motions.transforms, motions.types))
         best = None
         for change, proposed in tries.items():
             if not proposed:
                 continue
-            values = [judge(m)[0] for _, m in proposed]
-            part, tried = proposed[values.index(min(values))]
+            proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[: config.candidates]
+            part, tried = min(proposed, key=lambda p: judge(p[1])[0])
+            glance, _, tried = quick.improved(tried)
+            log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "glance": glance - quick(motions)[0]})
+            if glance >= quick(motions)[0]:
+                continue
             value, reached, refined = judge.improved(tried)
-            log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
-            log[-1] |= {"proposed": min(values) - lowest, "energy": value - lowest}
+            log[-1] |= {"after": reached, "energy": value - lowest}
             junk = len(refined) > len(motions) and reached > cost * (1 - judge.further)
             if value < (lowest if best is None else best[0]) and not junk:
                 best = (value, reached, refined)
@@ -71,13 +78,13 @@ def _with_part(found: Discovery, states, motions: PartMotions, part: int | None)
     return out
 
 
-def _parted(found: Discovery, states, motions: PartMotions) -> list[tuple[int, PartMotions]]:
-    """Each part as two, labels chosen anew: (part, motions)."""
-    blank = torch.zeros(len(motions) + 1)
-    return [
-        (k, _relabelled(found, states, replace(motions, types=types, transforms=transforms, confidence=blank)))
-        for k, transforms, types in in_two(found, motions.transforms, motions.types)
-    ]
+def _proposed(found: Discovery, states, motions: PartMotions, proposals: list[tuple]) -> list[tuple[int, PartMotions]]:
+    """Of each (part, transforms, types) the part and the motions, labels chosen anew."""
+    out = []
+    for k, transforms, types in proposals:
+        tried = replace(motions, types=types, transforms=transforms, confidence=torch.zeros(len(types)))
+        out.append((k, _relabelled(found, states, tried)))
+    return out
 
 
 def _relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:
@@ -100,11 +107,13 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
         for name in ("kept", "anew"):
             tried = _relabelled(found, states, motions) if name == "anew" else motions
             labels, count = settle_islands([s.gaussians for s in states], tried.labels, tried.transforms, config.islands)
+            if all(map(torch.equal, labels, motions.labels)):
+                continue
             value, reached, tried = judge.improved(replace(tried, labels=labels))
             rounds.append({"round": number, "labels": name, "islands": count, "before": cost, "after": reached, "energy": value - lowest})
             if best is None or value < best[0]:
                 best = (value, tried)
-        if best[0] >= lowest:
+        if best is None or best[0] >= lowest:
             break
         motions = settle_types(judge, best[1], config.compare_types_below, config.freedom_penalty)
     return motions, rounds

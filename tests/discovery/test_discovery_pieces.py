@@ -96,7 +96,7 @@ def test_ranking_is_by_score_without_the_same_motions_again():
     a, b = random_motions(2), random_motions(3)
     search = SimpleNamespace(probe=torch.randn(50, 3), radius=0.05)
     search.agree = lambda x, y: Search.agree(search, x, y)
-    make = lambda score, m: Explanation(m, Labelling([], []), 0.0, score)  # noqa: E731
+    make = lambda score, m: Explanation(m, Labelling([], []), score)  # noqa: E731
     order = ranked(search, [make(0.3, a), make(0.25, b), make(0.2, a[torch.tensor([1, 0])]), make(0.75, a[:1])])
     assert [(e.score, len(e.motions)) for e in order] == [(0.2, 2), (0.25, 3), (0.75, 1)]
 

@@ -9,6 +9,7 @@ from tiny import hinge, slide
 
 from p2gs.models import settle
 from p2gs.models.handover import PartMotions
+from p2gs.models.part_motions import PartMotionsConfig
 from p2gs.models.refine_motions import Judge
 from p2gs.models.screw_polish import PolishConfig
 from p2gs.ops import se3
@@ -35,7 +36,7 @@ def scene(monkeypatch):
     def reconsider(kind, T, proposed, more=(), limit=1):
         monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: more if part is None else proposed)
         motions = PartMotions([kind], T[None], torch.ones(1), [labels, labels], margins)
-        return motions, *settle.reconsider(judge_of(states, views), motions, limit)
+        return motions, *settle.reconsider(judge_of(states, views), motions, limit, PartMotionsConfig())
 
     return reconsider
 
@@ -47,12 +48,12 @@ def test_a_wrong_motion_is_exchanged_for_a_proposed_one_that_is_refined(scene):
     _, found, log = scene("revolute", wrong, [(hinge(), "revolute"), (near, "prismatic")])
     assert found.types == ["prismatic"] and log[0]["type"] == "prismatic" and log[0]["change"] == "exchanged"
     assert float((found.transforms[0] - slide()).norm()) < 0.01  # refined, from 0.035
-    assert log[0]["after"] < log[0]["cost"] and log[0]["energy"] < log[0]["proposed"] < 0 and found.confidence.tolist() == [0.5]
+    assert log[0]["after"] < log[0]["cost"] and log[0]["energy"] < 0 and log[0]["glance"] < 0 and found.confidence.tolist() == [0.5]
 
 
 def test_a_right_motion_stays(scene):
     motions, found, log = scene("prismatic", slide(), [(hinge(), "revolute")])
-    assert found is motions and len(log) == 1 and log[0]["energy"] > 0
+    assert found is motions and len(log) == 1 and log[0]["glance"] > 0
     motions, found, log = scene("prismatic", slide(), [])
     assert found is motions and log == []
 
@@ -66,7 +67,7 @@ def test_a_further_part_must_win_by_more(scene):
 
 
 def second_owns_the_panel(monkeypatch):
-    """Of a slide of one panel: states, labels, views, margins, and the slide a little off; a second part, once there is one, owns the panel."""
+    """States, labels, views and margins of one panel that slides, and its slide a little off; a second part, once there is one, owns it."""
     states, labels, views = two_states(slide())
     margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.5)
     off = slide()
@@ -84,7 +85,7 @@ def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
     def added(start, further):
         monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: [(further, "prismatic")] if part is None else [])
         motions = PartMotions(["prismatic"], start[None], torch.ones(1), [labels, labels], margins)
-        return len(settle.reconsider(judge_of(states, views), motions, 2)[0])
+        return len(settle.reconsider(judge_of(states, views), motions, 2, PartMotionsConfig())[0])
 
     assert added(off, slide()) == 2 and added(slide(), -off + 2 * torch.eye(4).double()) == 1
 
@@ -96,7 +97,7 @@ def test_two_bodies_with_amounts_of_their_own_are_taken_where_the_energy_falls(m
     motions = PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], margins)
     for price, parts in ((0.01, 2), (9.0, 1)):
         monkeypatch.setattr("p2gs.models.refine_motions.surface_energy", lambda found, T, types, price=price: price * len(types))
-        found, log = settle.reconsider(judge_of(states, views), motions, 2)
+        found, log = settle.reconsider(judge_of(states, views), motions, 2, PartMotionsConfig())
         assert len(found) == parts and log[0]["change"] == "parted"
 
 

@@ -16,11 +16,10 @@ from p2gs.models.discovery.rigid import Motions
 
 @dataclass
 class Explanation:
-    """A complete explanation: motions, labelling, value of the set and image-space score (lower is better)."""
+    """A complete explanation: motions, labelling and image-space score (lower is better)."""
 
     motions: Motions
     labelling: Labelling
-    value: float
     score: float = 0.0
 
 

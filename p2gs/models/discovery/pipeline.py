@@ -17,6 +17,7 @@ from p2gs.models.discovery.evidence import StateEvidence
 from p2gs.models.discovery.finish import Explanation, settle_parts
 from p2gs.models.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.models.discovery.labels import Graph, Labelling, label
+from p2gs.models.discovery.pairs import crossed
 from p2gs.models.discovery.pool import plausibility
 from p2gs.models.discovery.problem import Problem, build_problem, resampled
 from p2gs.models.discovery.result import Candidate, Discovery, FoundMotion
@@ -61,7 +62,7 @@ def discover(
     if limit > 0 and max(map(len, problem.samples)) >= config.min_moved and min(map(len, problem.samples)) >= 3:
         axes, still = directions(problem), static_axes(problem)
         most = max(limit, config.max_parts - 1)  # a bound cuts what is found, not the search
-        sets: list[tuple[float, Motions]] = []
+        sets: list[Motions] = []
         searches = max(config.searches, 1)
         figures |= {"axes": axes.tolist(), "search": []}
         for number in range(searches):
@@ -71,12 +72,12 @@ def discover(
             search = search or one
             solutions = one.solve()
             solutions += one.alternatives(solutions)
-            found = [(value, one.pool.motions[torch.tensor(chosen)]) for value, chosen in solutions if value > 0 and chosen]
-            sets += [f for f in found[: config.candidates] if not any(search.agree(f[1], other) for _, other in sets)]
+            found = [one.pool.motions[torch.tensor(chosen)] for value, chosen in solutions if value > 0 and chosen]
+            sets += [f for f in found[: config.candidates] if not any(search.agree(f, other) for other in sets)]
             tell("selection", 0.2 + 0.5 * (number + 1) / searches)
             figures["search"].append({"motions_tried": len(swept.motions), **one.trace[-1]} if one.trace else {})
         lap("selection", 0.7)
-        explanations = [finish(problem, graphs, motions, value, limit, still) for value, motions in sets]
+        explanations = [finish(problem, graphs, motions, limit, still) for motions in sets]
         explanations += again(problem, graphs, search, explanations, limit, still)
         explanations = ranked(search, explanations)
         best = [divided(problem, graphs, e, limit, still) for e in explanations[: config.candidates]]
@@ -84,11 +85,11 @@ def discover(
         lap("labels", 0.95)
     if not explanations:
         nothing = [torch.ones(len(s), 1) for s in problem.surfels]
-        explanations = [Explanation(Motions.empty(), Labelling(nothing, nothing), 0.0)]
+        explanations = [Explanation(Motions.empty(), Labelling(nothing, nothing))]
     candidates = [describe(problem, e, start, end) for e in explanations]
     best = candidates[0]
     out = Discovery(
-        motions=best.motions, surfels=best.surfels, probability=best.probability, score=best.score, value=best.value,
+        motions=best.motions, surfels=best.surfels, probability=best.probability, score=best.score,
         labels_start=best.labels_start, labels_end=best.labels_end, candidates=candidates, diagnostics=figures | {"seconds": seconds},
         problem=problem, graphs=graphs, search=search,
     )  # fmt: skip
@@ -98,7 +99,6 @@ def discover(
     out.diagnostics["candidates"] = [
         {
             "score": round(c.score, 4),
-            "value": round(c.value, 4),
             "parts": [(m.type, round(m.amount, 4), round(m.confidence, 3)) for m in c.motions],
         }
         for c in candidates
@@ -111,7 +111,7 @@ def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate
     """The explanation by other motions: transforms [K, 4, 4] start -> end, types "revolute" | "prismatic". Every surfel chooses anew."""
     motions = sided(found.problem, as_motions(transforms, types))
     labelling = label(found.problem, motions, found.graphs, revealed=True)
-    return Candidate(found_motions(found.problem, motions, labelling), found.problem.surfels, labelling.probability, 0.0, 0.0)
+    return Candidate(found_motions(found.problem, motions, labelling), found.problem.surfels, labelling.probability, 0.0)
 
 
 def surface_energy(found: Discovery, transforms: Tensor, types: list[str]) -> float:
@@ -161,9 +161,21 @@ def in_two(found: Discovery, transforms: Tensor, types: list[str]) -> list[tuple
     return out
 
 
+def places_changed(found: Discovery, transforms: Tensor, types: list[str], count: int = 3) -> list[tuple[int, Tensor, list[str]]]:
+    """Two parts each with the other's end for its own, for the ``count`` pairs that explain most so: (one of them, motions [K, 4, 4], types)."""
+    if found.search is None or len(types) < 2:
+        return []
+    own = sided(found.problem, as_motions(transforms, types))
+    out = []
+    for k, more in crossed(found.search, label(found.problem, own, found.graphs), own, count):
+        kinds = ["revolute" if bool(t) else "prismatic" for t in more.turn]
+        out.append((k, torch.stack([more.transform(i) for i in range(len(more))]), kinds))
+    return out
+
+
 def sided(problem: Problem, motions: Motions) -> Motions:
     """The motions with the thickness of plate under which most of the moved surface arrives."""
-    return two_sided(problem, motions, ExclusiveGain(problem, problem.samples, [torch.ones(len(s)) for s in problem.samples]))
+    return two_sided(problem, motions, ExclusiveGain(problem, problem.samples, problem.weights))
 
 
 def as_motions(transforms: Tensor, types: list[str]) -> Motions:
@@ -174,7 +186,7 @@ def as_motions(transforms: Tensor, types: list[str]) -> Motions:
     return Motions(turn, screw.axis.float(), screw.origin.float(), amount.float())
 
 
-def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float, limit: int, axes: Tensor) -> Explanation:
+def finish(problem: Problem, graphs: list[Graph], motions: Motions, limit: int, axes: Tensor) -> Explanation:
     """Label and fit a chosen set; drop parts without mass, and those that the score is better without."""
     motions, labelling = settle_parts(problem, graphs, motions, axes)
     while (pair := twins(problem, motions, labelling)) is not None:
@@ -185,7 +197,7 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, value: float
         if mass[k] >= problem.config.min_mass:
             break
         motions, labelling = settle_parts(problem, graphs, without(motions, k), axes, rounds=1)
-    return prune(problem, graphs, motions, labelling, value, limit, axes)
+    return prune(problem, graphs, motions, labelling, limit, axes)
 
 
 def divided(problem: Problem, graphs: list[Graph], found: Explanation, limit: int, axes: Tensor) -> Explanation:
@@ -197,12 +209,12 @@ def divided(problem: Problem, graphs: list[Graph], found: Explanation, limit: in
                 labelling = label(problem, motions, graphs)
                 score = total_score(problem, motions, labelling)
                 if score < best.score:
-                    best = Explanation(motions, labelling, found.value, score)
+                    best = Explanation(motions, labelling, score)
         if best is found:
             break
         motions, labelling = settle_parts(problem, graphs, best.motions, axes, rounds=1)
         score = total_score(problem, motions, labelling)
-        found = min(best, Explanation(motions, labelling, found.value, score), key=lambda e: e.score)
+        found = min(best, Explanation(motions, labelling, score), key=lambda e: e.score)
     return found
 
 
@@ -218,7 +230,7 @@ def again(problem: Problem, graphs: list[Graph], search: Search, found: list[Exp
         if chosen and not any(search.same(chosen, other) for other in known):
             known.append(chosen)
             motions = search.pool.motions[torch.tensor(chosen)]
-            out.append(finish(problem, graphs, motions, search.value(chosen), limit, axes))
+            out.append(finish(problem, graphs, motions, limit, axes))
     return out
 
 
@@ -232,7 +244,7 @@ def ranked(search: Search, found: list[Explanation]) -> list[Explanation]:
 
 
 def prune(
-    problem: Problem, graphs: list[Graph], motions: Motions, labelling: Labelling, value: float, limit: int, axes: Tensor
+    problem: Problem, graphs: list[Graph], motions: Motions, labelling: Labelling, limit: int, axes: Tensor
 ) -> Explanation:
     """Drop parts, the least needed first, down to ``limit`` and while the explanation of both states' images gets no worse without them."""
     score = total_score(problem, motions, labelling)
@@ -246,7 +258,7 @@ def prune(
             break
         motions, labelling = settle_parts(problem, graphs, fewer, axes, rounds=1)
         score = total_score(problem, motions, labelling)
-    return Explanation(motions, labelling, value, score)
+    return Explanation(motions, labelling, score)
 
 
 def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> float:
@@ -288,7 +300,7 @@ def masses(problem: Problem, labelling: Labelling) -> list[float]:
 
 def describe(problem: Problem, e: Explanation, start: StateEvidence, end: StateEvidence) -> Candidate:
     """Motions in words, confidences, labels of the input points."""
-    c = Candidate(found_motions(problem, e.motions, e.labelling), problem.surfels, e.labelling.probability, e.score, e.value)
+    c = Candidate(found_motions(problem, e.motions, e.labelling), problem.surfels, e.labelling.probability, e.score)
     c.labels_start = c.label_points(start.points, start.colours, 0)[0]
     c.labels_end = c.label_points(end.points, end.colours, 1)[0]
     return c

@@ -39,7 +39,6 @@ class Candidate:
     surfels: list[Surfels]
     probability: list[Tensor]
     score: float
-    value: float
     labels_start: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
     labels_end: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
 

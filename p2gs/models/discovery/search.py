@@ -39,11 +39,10 @@ def two_sided(problem: Problem, motions: Motions, gain: Callable[[Motions], Tens
 
 
 class ExclusiveGain:
-    """Plausible, unsaturated evidence of motions [B] over what others leave, ``left`` [P] per state in 0..1."""
+    """Plausible, unsaturated evidence of motions [B] over samples [P] of both states, weights [P] each."""
 
-    def __init__(self, problem: Problem, samples: list[Tensor], left: list[Tensor]):
-        self.problem, self.samples = problem, samples
-        self.weights = [w * x for w, x in zip(problem.weights, left, strict=False)]
+    def __init__(self, problem: Problem, samples: list[Tensor], weights: list[Tensor]):
+        self.problem, self.samples, self.weights = problem, samples, weights
 
     def __call__(self, motions: Motions) -> Tensor:
         pays = self.problem.pay(motions, self.samples)
@@ -86,9 +85,12 @@ class Search:
             motions = Motions.cat([motions, extra])
         if len(motions) == 0:
             return motions, torch.zeros(0)
-        gain = ExclusiveGain(self.problem, self.samples, left)
+        return self.sharpened(motions, ExclusiveGain(self.problem, self.samples, [w * x for w, x in zip(self.problem.weights, left, strict=True)]), fine, each)
+
+    def sharpened(self, motions: Motions, gain: ExclusiveGain, fine: int, each: bool = False) -> tuple[Motions, Tensor]:
+        """The ``fine`` motions of greatest gain that come of ``motions`` [B] when fitted to the gain's samples, and their gains."""
         motions = two_sided(self.problem, motions, gain)
-        sharp = gauss_newton(self.problem, motions, self.samples, [w * x for w, x in zip(self.problem.weights, left, strict=False)])
+        sharp = gauss_newton(self.problem, motions, gain.samples, gain.weights)
         both = Motions.cat([motions, sharp])
         value = gain(both)
         n = len(motions)
