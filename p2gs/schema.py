@@ -166,7 +166,7 @@ def describe(hint: Any) -> str:
         return words[hint]
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
-        return f"one of {', '.join(map(str, args))}" if len(args) > 1 else f"'{args[0]}'"
+        return f"one of {', '.join(map(str, args))}" if len(args) > 1 else "".join(f"'{a}'" for a in args)
     if origin in (Union, types.UnionType):
         return " or ".join("null" if a is type(None) else describe(a) for a in args)
     if origin in (list, tuple):

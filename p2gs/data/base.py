@@ -90,7 +90,8 @@ class TwoStateData(LightningDataModule):
             raise UserError(f"data.max_views is {max_views}, but it must be at least 1")
         self.root: Optional[str] = root
         self.downscale, self.max_views = downscale, max_views
-        self.depth, self.seed, self.normalize = depth, seed, normalize
+        self.depth: DepthMode = depth
+        self.seed, self.normalize = seed, normalize
         self._files: Optional[list[Path]] = None
         self._raw: Optional[TwoStateScene] = None
         self._scene: Optional[TwoStateScene] = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -99,6 +99,11 @@ class ArticulationPhase(ImagePhase):
     uses = ("sharpened", "motions")
     gives = "learned"
 
+    times: Tensor
+    repel_points: Tensor
+    knn_index: Tensor
+    spacing: Tensor
+
     @classmethod
     def build(cls, run: RunContext, section, *, states, canonical, sharpened=None, motions=None) -> "ArticulationPhase":
         if motions is None and section.config.init == "discovery":
@@ -129,6 +134,7 @@ class ArticulationPhase(ImagePhase):
         check_losses(config, losses, canonical)
         labels = canonical.labels
         if config.init == "discovery":
+            assert motions is not None  # ``build`` has seen to it
             labels, transforms = add_spare(labels, motions.transforms, num_parts - 1 - len(motions), self.generator(0, 6))
             spare = len(transforms) - len(motions)
             self.types, self.confidence = [*motions.types, *["free"] * spare], torch.cat([motions.confidence, torch.zeros(spare)])
@@ -188,7 +194,7 @@ class ArticulationPhase(ImagePhase):
 
     def repel_force(self, points: Tensor, step: int) -> Tensor:
         """The force of the loss ``art`` at points [N, 3] of any state (the repel points lie on the base, which does not move)."""
-        art = self.losses["art"]
+        art: Any = self.losses["art"]
         return art.force(points, self.repel_points, self.extent, art.tau(self.extent, step, self.total_steps))
 
     def refresh(self, step: int, g: GaussianTensors, probs: Tensor) -> None:
@@ -282,6 +288,7 @@ class ArticulationPhase(ImagePhase):
         for t in times:
             posed = carry(g, labels, self.screws.at(t - self.times))
             out = render_gaussians(posed, shot.camera, torch.ones(3, device=device), features=colours, backend=self.rasterizer)
+            assert out.features is not None
             painted = out.features + (1 - out.alpha[..., None])
             strips["rgb"].append(out.colour)
             strips["parts"].append(painted)

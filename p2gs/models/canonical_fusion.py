@@ -49,6 +49,9 @@ class CanonicalFusionPhase(ImagePhase):
     uses = ("sharpened", "motions")
     gives = "canonical"
 
+    betas: Tensor
+    transforms: Tensor
+
     @classmethod
     def build(cls, run: RunContext, section, *, states, sharpened=None, motions=None) -> "CanonicalFusionPhase":
         """``states`` tell what free space says: an overfitted lid explains noise that no wall behind it does."""
@@ -86,9 +89,9 @@ class CanonicalFusionPhase(ImagePhase):
         hidden = None
         if stacks is not None and motions is not None and config.canonical.hidden > 0:
             away = (motions.transforms, se3.inverse(motions.transforms))
-            hidden = tuple(
-                hidden_share(s.gaussians.means, motions.labels[i], away[i], stacks[1 - i], SURFACE) for i, s in enumerate(states)
-            )
+            labels = motions.labels
+            shares = [hidden_share(s.gaussians.means, labels[i], away[i], stacks[1 - i], SURFACE) for i, s in enumerate(states)]
+            hidden = (shares[0], shares[1])
         fused = fuse(states[0].gaussians, states[1].gaussians, motions, config.canonical, hidden, num_parts)
         if stacks is not None and motions is not None and fused.offsets is None and config.canonical.free_space > 0:
             T, tau = with_static(motions.transforms), config.canonical.free_space

@@ -147,7 +147,7 @@ class Phase(LightningModule, Stage):
         """Render, losses, backward pass, optimiser. Raises UserError where no Gaussian is left and where the loss is not finite."""
         step = visit.step
         check_gaussians(self.phase_name, len(self.splats))
-        optimizer = self.optimizers()
+        optimizer: Any = self.optimizers()  # the one
         rates = self.learning_rates(step)
         for group in optimizer.param_groups:
             if group["name"] in rates:
@@ -157,9 +157,10 @@ class Phase(LightningModule, Stage):
         total = self.total_loss(inputs)
         check_loss(self.phase_name, step, self.scalars)
         total.backward()
-        if self.track_gradients and inputs.render is not None and inputs.render.means2d_abs_grad is not None:
+        render = inputs.render
+        if self.track_gradients and render is not None and render.means2d_abs_grad is not None and render.radii is not None:
             # in units of the full image, so that levels of the resolution schedule weigh alike
-            self.splats.note_gradients(inputs.render.means2d_abs_grad, inputs.render.radii, float(inputs.render.alpha.shape[0]))
+            self.splats.note_gradients(render.means2d_abs_grad, render.radii, float(render.alpha.shape[0]))
         self.constrain_gradients()
         optimizer.step()
 
