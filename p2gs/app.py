@@ -6,7 +6,7 @@ import argparse
 import difflib
 import os
 import sys
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from p2gs.machine import is_of_the_machine, machine_says
 from p2gs.stopping import EXIT_CODE, Terminated
@@ -65,7 +65,7 @@ def parser(prog: str = "p2gs") -> Parser:
     fit.add_argument("--seed", metavar="N", help="default 0")
     fit.add_argument("--device", metavar="auto|cpu|cuda", help="default auto")
     fit.add_argument("--threads", metavar="N", help="CPU threads (default all cores)")
-    strict = {"action": "store_true", "help": "refuse files that lead out of the scene's folder (else they are only named)"}
+    strict: dict[str, Any] = {"action": "store_true", "help": "refuse files that lead out of the scene's folder (else they are only named)"}
     fit.add_argument("--strict_paths", "--strict-paths", **strict)
 
     test = add("test", "score a run against the scene's ground truth and write metrics.json")
@@ -132,7 +132,7 @@ def parser(prog: str = "p2gs") -> Parser:
     capture.add_argument("end", metavar="OPEN", help="the same of the second state; nothing but the parts may have moved")
     capture.add_argument("--out", required=True, metavar="SCENE", help="folder to write")
     capture.add_argument("--masks", metavar="DIR", help="masks of the object, white = object (default: alpha, else from 3D)")
-    means = {"choices": ("object", "ignore"), "default": "object", "help": "ignore: nerfstudio's masks"}
+    means: dict[str, Any] = {"choices": ("object", "ignore"), "default": "object", "help": "ignore: nerfstudio's masks"}
     capture.add_argument("--mask_means", "--mask-means", **means)
     capture.add_argument("--poses", metavar="PATH", help="a COLMAP model or transforms.json of both states: no structure from motion")
     capture.add_argument("--static", type=int, metavar="N", help="which hypothesis of capture.json is the room (default: the widest)")
@@ -174,7 +174,8 @@ def parser(prog: str = "p2gs") -> Parser:
 def run(words: list[str], prog: str = "p2gs") -> int:
     """Parse and carry out one command; returns the exit code. Mistakes come as one line ``error: ...`` on stderr."""
     top = parser(prog)
-    for stream in (sys.stdout, sys.stderr):  # names of files may hold bytes that are no text
+    streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
+    for stream in streams:  # names of files may hold bytes that are no text
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     try:

@@ -7,83 +7,100 @@ field by field. ``callbacks`` at the top is for all phases; a phase's own ``call
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import os
 import pkgutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Iterable, Optional
+from typing import Any, Iterable, Optional
 
+from p2gs.callbacks.base import CALLBACKS, Callback
 from p2gs.class_path import plain_sections, with_class_paths
-from p2gs.config_files import Layer, overrides_layer, parse_overrides, provenance, read_config, to_yaml
-from p2gs.registry import load_plugins
-from p2gs.run_schema import Options, dataset_names, run_schema
-from p2gs.schema import Plain, Section, build, check_keys, complete, merge, plain
+from p2gs.config_files import Layer, overrides_layer, parse_overrides, read_config, to_yaml
+from p2gs.data.base import DATASETS, TwoStateData
+from p2gs.losses.base import LOSSES, Loss
+from p2gs.models.phase import PHASES
+from p2gs.provenance import provenance
+from p2gs.registry import Registry, load_plugins
+from p2gs.run_schema import Options, data_class, run_keys
+from p2gs.schema import Given, Plain, check_keys, merge
 from p2gs.trainer_options import check_trainer_options
 from p2gs.types import UserError, short
 
-if TYPE_CHECKING:
-    from lightning.pytorch import LightningDataModule
-
-    from p2gs.callbacks.base import Callback
-    from p2gs.losses.base import Loss
-
 
 class PhaseSection:
-    """A phase's part of the config. config: instance of ``Phase.Config``.  losses, callbacks: those switched on, by name."""
+    """A phase's part of the config. config: instance of ``Phase.Config``.  losses, callbacks: those switched on, by name.
 
-    def __init__(self, config: Any, losses: dict[str, "Loss"], callbacks_section: Section, callbacks: Plain):
-        self.config = config
-        self.losses = losses
-        self._callbacks = (callbacks_section, callbacks)
+    callbacks are those of all phases (``shared``, as given) with what the phase's own section says laid on them.
+    """
+
+    def __init__(self, name: str, tree: Plain, shared: Plain):
+        phase, path = PHASES[name], f"phases.{name}."
+        trained = getattr(phase, "trained", True)
+        self._own: Plain = tree.get("callbacks") or {}
+        self._config = Given(phase.Config, {k: v for k, v in tree.items() if k not in ("losses", "callbacks")}, path)
+        self._losses = switched_on(LOSSES, tree.get("losses") or {}, f"{path}losses.") if trained else None
+        self._callbacks = switched_on(CALLBACKS, merge(shared, self._own), f"{path}callbacks.") if trained else {}
+        self.config: Any = self._config.make()
+        self.losses: dict[str, Loss] = {name: given.make() for name, given in (self._losses or {}).items()}
         self.callbacks = self.new_callbacks()
 
-    def new_callbacks(self) -> dict[str, "Callback"]:
+    def new_callbacks(self) -> dict[str, Callback]:
         """Fresh callbacks, for a phase that runs more than once."""
-        section, values = self._callbacks
-        return build(values, section, "callbacks.")
+        return {name: given.make() for name, given in self._callbacks.items()}
+
+    def decisive(self) -> Plain:
+        """What decides the phase's result: its options, losses, and callbacks that change it."""
+        if self._losses is None:
+            return self._config.values
+        callbacks = {name: given.values for name, given in self._callbacks.items() if self.callbacks[name].changes_result}
+        return {**self._config.values, "losses": {name: given.values for name, given in self._losses.items()}, "callbacks": callbacks}
+
+    def to_dict(self) -> Plain:
+        """All of it; of the callbacks what the phase's own section says, so that a later file still reaches the others."""
+        if self._losses is None:
+            return self._config.values
+        full = {name: given.values for name, given in self._callbacks.items()}
+        own = {name: None if given is None else {k: full[name][k] for k in given} for name, given in self._own.items()}
+        losses = written(LOSSES, self._losses)
+        return {**self._config.values, "losses": losses, "callbacks": with_class_paths(own, CALLBACKS)}
+
+
+def switched_on(registry: Registry, tree: Plain, path: str) -> dict[str, Given]:
+    """The registered classes that the tree mentions, but those it says null of."""
+    return {name: Given(cls, tree[name], f"{path}{name}.") for name, cls in registry.items() if tree.get(name) is not None}
+
+
+def written(registry: Registry, on: dict[str, Given]) -> Optional[Plain]:
+    """Every registered name with its options, null where it is off."""
+    return with_class_paths({name: on[name].values if name in on else None for name in registry}, registry)
 
 
 class RunConfig:
     """The merged config. Attributes: those of ``Options``, ``phases`` (name -> PhaseSection), ``data`` (built when first asked for)."""
 
-    def __init__(self, values: Plain, schema: Section):
-        self._values = values  # completed: every key, typed
-        self._schema = schema
-        own = Section(Options, {f.name: schema.children[f.name] for f in dataclasses.fields(Options)})
-        options: Options = build({name: values[name] for name in own.children}, own)
+    def __init__(self, tree: Plain, data_format: Optional[str]):
+        """tree: merged, its keys checked."""
+        self._options = Given(Options, {k: v for k, v in tree.items() if k not in ("data", "phases", "callbacks")})
+        options: Options = self._options.make()
         self.seed, self.run, self.device, self.threads = options.seed, options.run, options.device, options.threads
         self.rasterizer, self.num_parts, self.plugins = options.rasterizer, options.num_parts, options.plugins
         self.exact_parts, self.strict_paths, self.stages = options.exact_parts, options.strict_paths, options.stages
-        self.trainer: Plain = values["trainer"] or {}
+        self.trainer: Plain = options.trainer or {}
         check_trainer_options(self.trainer)
-        self.data_options: Plain = values["data"]
-        self._data: Optional[LightningDataModule] = None
-        self.phases: dict[str, PhaseSection] = {}
-        for name, phase in values["phases"].items():
-            if phase is not None:
-                self.phases[name] = self._phase(name, phase)
-
-    def _phase(self, name: str, values: Plain) -> PhaseSection:
-        section = self._schema.children["phases"].children[name]
-        fields = Section(section.make, {k: c for k, c in section.children.items() if k not in ("losses", "callbacks")})
-        config = build({k: values[k] for k in fields.children}, fields, f"phases.{name}.")
-        if "losses" not in section.children:
-            return PhaseSection(config, {}, self._schema.children["callbacks"], complete({}, self._schema.children["callbacks"]))
-        losses = build(values["losses"], section.children["losses"], f"phases.{name}.losses.")
-        callbacks = complete(merge(self._values["callbacks"], values["callbacks"]), self._schema.children["callbacks"])
-        return PhaseSection(config, losses, self._schema.children["callbacks"], callbacks)
+        given = {k: v for k, v in (tree.get("data") or {}).items() if k != "format"}
+        self._given_data, self._data = Given(data_class(data_format), given, "data."), None
+        self.data_options: Plain = {"format": data_format, **self._given_data.values}
+        shared, phases = tree.get("callbacks") or {}, tree.get("phases") or {}
+        self._callbacks = switched_on(CALLBACKS, shared, "callbacks.")
+        self.phases = {name: PhaseSection(name, phase, shared) for name, phase in phases.items() if phase is not None}
 
     @property
-    def data(self) -> "LightningDataModule":
+    def data(self) -> TwoStateData:
         """The data module. Raises UserError when no format or no required option (root) is given."""
         if self._data is None:
-            options = {k: v for k, v in self.data_options.items() if k != "format"}
             if self.data_options["format"] is None:
-                raise UserError(f"data.format is not given (--data.format NAME); known: {', '.join(sorted(dataset_names()))}")
-            section = self._schema.children["data"]
-            section = Section(section.make, {k: c for k, c in section.children.items() if k != "format"})
-            self._data = build(options, section, "data.")
+                raise UserError(f"data.format is not given (--data.format NAME); known: {', '.join(sorted(DATASETS))}")
+            self._data = self._given_data.make()
             self._data.strict_paths = self.strict_paths
         return self._data
 
@@ -91,9 +108,7 @@ class RunConfig:
     def scene_name(self) -> str:
         """Name of the scene: its folder's, or the format's where the data come from no folder."""
         root = self.data_options.get("root")
-        if isinstance(root, (str, Path)) and str(root):
-            return Path(root).resolve().name
-        return str(self.data_options["format"] or "run")
+        return Path(root).resolve().name if root else str(self.data_options["format"] or "run")
 
     @property
     def run_dir(self) -> Path:
@@ -102,35 +117,19 @@ class RunConfig:
 
     def phase_config(self, name: str) -> Any:
         """Options of a phase; their defaults where this config does not mention it. Raises UserError for an unknown name."""
-        from p2gs.models.phase import PHASES
-
         return self.phases[name].config if name in self.phases else PHASES[name].Config()
 
-    def section(self, name: str) -> Plain:
-        """What decides the result of a phase (its fields, enabled losses, callbacks that change the result), or a top-level key.
-
-        Plain values, for hashing. Raises KeyError for an unknown name.
-        """
-        if name not in self.phases:
-            return plain(self._values[name])
-        phase, values = self.phases[name], plain(self._values["phases"][name])
-        if "losses" not in values:
-            return values
-        values["losses"] = {k: v for k, v in values["losses"].items() if v is not None}
-        values["callbacks"] = {k: plain(c) for k, c in phase.callbacks.items() if c.changes_result}
-        return values
+    def section(self, name: str) -> Any:
+        """What decides the result of a phase, the data's options or a top-level option, as plain values. Raises KeyError."""
+        if name in self.phases:
+            return self.phases[name].decisive()
+        return self.data_options if name == "data" else self._options.values[name]
 
     def to_dict(self) -> Plain:
         """The whole merged config, defaults included, as plain values: ``load_config`` reads it back."""
-        from p2gs.callbacks.base import CALLBACKS
-        from p2gs.losses.base import LOSSES
-
-        out = plain(self._values)
-        for place in (out, *filter(None, out["phases"].values())):
-            for kind, registry in (("losses", LOSSES), ("callbacks", CALLBACKS)):
-                if kind in place:
-                    place[kind] = with_class_paths(place[kind], registry)
-        return out
+        phases = {name: section.to_dict() for name, section in self.phases.items()}
+        phases |= {name: None for name in PHASES if name not in phases}
+        return {**self._options.values, "data": self.data_options, "phases": phases, "callbacks": written(CALLBACKS, self._callbacks)}
 
 
 # -- loading -----------------------------------------------------------------------------------------------------------------------
@@ -170,27 +169,15 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
         formats.append(current)
     if current is None and isinstance(root, str):
         current = _format_found(Path(root))
-    schema = run_schema(current)
-    merged: Plain = {}
+    keys, merged = run_keys(current), {}
     for layer, name in zip(layers, formats, strict=True):
-        check_keys(layer.tree, schema if name in (None, current) else run_schema(name), layer.where)
-        tree = layer.tree
-        if isinstance(tree.get("data"), dict):  # another format later: keep what it knows too
-            tree = {**tree, "data": {k: v for k, v in tree["data"].items() if k in schema.children["data"].children}}
-        merged = merge(merged, tree)
+        check_keys(layer.tree, keys if name in (None, current) else run_keys(name), layer.where)
+        merged = merge(merged, layer.tree)
     merged.pop("p2gs", None)
     merged["plugins"] = names
-    merged.setdefault("data", {})
-    merged["data"] = {**(merged["data"] or {}), "format": current}
-    values = complete(merged, schema)
-    values.pop("p2gs")
-    phases = merged.get("phases") or {}
-    values["phases"] = {name: values["phases"][name] for name in dict.fromkeys([*phases, *values["phases"]])}  # in the order of the files
-    for name, phase in phases.items():
-        if phase is not None and "callbacks" in values["phases"][name]:  # a phase's callbacks say only what differs from the top
-            given = complete(phase.get("callbacks") or {}, schema.children["callbacks"])
-            values["phases"][name]["callbacks"] = _mentioned(given, phase.get("callbacks") or {})
-    return RunConfig(values, schema)
+    if merged.get("data"):  # another format came later: keep what it knows too
+        merged["data"] = {k: v for k, v in merged["data"].items() if k in keys["data"]}
+    return RunConfig(merged, current)
 
 
 def _format_found(root: Path) -> str:
@@ -208,10 +195,6 @@ def _format_found(root: Path) -> str:
         known = ", ".join(LAYOUTS)
         raise UserError(f"data.format is not given, and {root} looks like none of the layouts {known}; give --data.format NAME")
     return found
-
-
-def _mentioned(values: Plain, tree: Plain) -> Plain:
-    return {k: _mentioned(values[k], v) if isinstance(v, dict) and isinstance(values[k], dict) else values[k] for k, v in tree.items()}
 
 
 def import_builtins() -> None:

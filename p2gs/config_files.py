@@ -1,9 +1,8 @@
-"""Reading config files: where they are looked for, ``include``, strict YAML, command-line overrides, saving."""
+"""Reading config files: where they are looked for, ``include``, strict YAML, command-line overrides."""
 
 from __future__ import annotations
 
-import shlex
-import subprocess
+import functools
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, Optional
 import yaml
 
 import p2gs
+from p2gs.registry import suggest
 from p2gs.schema import Plain, merge, nested
 from p2gs.types import UserError, short
 
@@ -57,8 +57,6 @@ def find_config(name: str, beside: Optional[Path] = None) -> Path:
         for candidate in (path, path.with_name(path.name + ".yaml")) if path.name else ():
             if _is_file(candidate):
                 return candidate
-    from p2gs.registry import suggest
-
     known = sorted({str(p.relative_to(f).as_posix()) for f in config_folders() for p in f.rglob("*.yaml")})
     raise UserError(f"config file {short(name)} is not there{suggest(name[:200], known)}")
 
@@ -146,80 +144,44 @@ def parse_overrides(words: list[str]) -> list[tuple[str, Any]]:
 
     Raises UserError where a value is missing or a word belongs to no option.
     """
-    out: list[tuple[str, Any]] = []
-    i = 0
-    while i < len(words):
-        word = words[i]
+    out, rest = [], iter(words)
+    for word in rest:
         if not word.startswith("--") or len(word) < 3:
             raise UserError(f"'{word}' belongs to no option (single values are given as --key value, config files as -c FILE)")
         key, equals, value = word[2:].partition("=")
         if not equals:
-            if i + 1 >= len(words) or (words[i + 1].startswith("--") and len(words[i + 1]) > 2):
+            value = next(rest, "--none")
+            if value.startswith("--") and len(value) > 2:
                 raise UserError(f"--{key} needs a value")
-            i += 1
-            value = words[i]
         out.append((key, _read_value(key, value)))
-        i += 1
     return out
 
 
 def _read_value(key: str, text: str) -> Any:
-    if text.strip() in ("null", "~") or text.strip()[:1] in ("{", "["):
-        try:
-            value = yaml.load(text, Loader=_StrictLoader)
-        except _UNREADABLE as err:
-            raise UserError(f"--{key}: {short(text)} cannot be read ({getattr(err, 'problem', err)})") from err
-        _check_tree({key: value}, f"--{key}")
-        return value
-    return text
+    if text.strip() not in ("null", "~") and text.strip()[:1] not in ("{", "["):
+        return text
+    try:
+        value = yaml.load(text, Loader=_StrictLoader)
+    except _UNREADABLE as err:
+        raise UserError(f"--{key}: {short(text)} cannot be read ({getattr(err, 'problem', err)})") from err
+    _check_tree({key: value}, f"--{key}")
+    return value
 
 
 def overrides_layer(overrides: list[tuple[str, Any]]) -> Layer:
-    tree: Plain = {}
-    for key, value in overrides:
-        tree = merge(tree, nested(key, value))
-    return Layer(tree)
-
-
-# -- saving ------------------------------------------------------------------------------------------------------------------------
+    """Single options as a layer of their own."""
+    return Layer(functools.reduce(merge, (nested(key, value) for key, value in overrides), {}))
 
 
 class _Dumper(yaml.SafeDumper):
+    """Lists on one line, nothing by reference."""
+
     def ignore_aliases(self, data):
         return True
 
 
-def _represent_list(dumper, data):
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
-
-
-_Dumper.add_representer(list, _represent_list)
+_Dumper.add_representer(list, lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True))
 
 
 def to_yaml(tree: Plain) -> str:
     return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=140)
-
-
-def provenance() -> Plain:
-    """Version, git commit (null when not run from a git checkout) and command line of this run."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        number = version("p2gs")
-    except PackageNotFoundError:
-        number = None
-    return {"version": number, "git": _git_commit(), "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}
-
-
-def _git_commit() -> Optional[str]:
-    package = Path(p2gs.__file__).parent
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", str(package), *words], capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-    try:
-        if Path(git("rev-parse", "--show-toplevel")).resolve() != package.parent.resolve():
-            return None  # installed inside somebody else's repository
-        return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.SubprocessError):
-        return None

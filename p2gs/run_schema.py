@@ -6,8 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, Optional, Union
 
+from p2gs.callbacks.base import CALLBACKS
+from p2gs.data.base import DATASETS, TwoStateData
+from p2gs.losses.base import LOSSES
+from p2gs.models.phase import PHASES
 from p2gs.registry import suggest
-from p2gs.schema import Leaf, Section, section_of, switches
+from p2gs.schema import Keys, keys_of
 from p2gs.types import UserError, short
 
 STAGES = ("single_state", "registration", "discovery", "sharpen", "canonical_fusion", "articulation", "finish")
@@ -24,6 +28,7 @@ class Options:
     become one, fewer get spare slots beside them. plugins: modules that register losses, callbacks, phases, ...
     stages: phases in the order in which they run, each of which ``phases`` has to mention.
     strict_paths: files of the scene that lead out of its folder are refused; they are only named else.
+    trainer: what goes to each phase's Lightning Trainer.
     """
 
     seed: int = 0
@@ -36,6 +41,7 @@ class Options:
     plugins: list[str] = field(default_factory=list)
     stages: list[str] = field(default_factory=lambda: list(STAGES))
     strict_paths: bool = False
+    trainer: Optional[dict] = field(default_factory=dict)
 
     def __post_init__(self):
         if self.run is not None and "\0" in self.run:
@@ -50,52 +56,26 @@ class Options:
             raise UserError(f"threads: expected at least 1, got {self.threads}")
 
 
-def run_schema(data_format: Optional[str]) -> Section:
+def run_keys(data_format: Optional[str]) -> Keys:
     """All keys a config may have, given the data format and what is registered by now.
 
-    A phase whose class says ``trained = False`` has neither losses nor callbacks.
+    A phase whose class says ``trained = False`` has neither losses nor callbacks. Raises UserError for an unknown format.
     """
-    from p2gs.callbacks.base import CALLBACKS
-    from p2gs.losses.base import LOSSES
-    from p2gs.models.phase import PHASES
-
-    losses, callbacks = switches(LOSSES.items()), switches(CALLBACKS.items())
-    root = section_of(Options)
-    root.children["trainer"] = Leaf(Optional[dict], {})
-    root.children["p2gs"] = Leaf(dict, {})  # what save_config notes; read over
-    root.children["data"] = section_of(_dataset(data_format)) if data_format else _any_data()
-    root.children["data"].children = {"format": Leaf(Optional[str], None), **root.children["data"].children}
-    phases = root.children["phases"] = Section(dict)
+    losses = {name: keys_of(cls) for name, cls in LOSSES.items()}
+    callbacks = {name: keys_of(cls) for name, cls in CALLBACKS.items()}
+    phases = {}
     for name, cls in PHASES.items():
-        phase = phases.children[name] = section_of(cls.Config)
-        phase.optional, phase.on = True, False
-        if not getattr(cls, "trained", True):
-            continue
-        for key, section in (("losses", losses), ("callbacks", callbacks)):
-            if key in phase.children:
-                raise TypeError(f"{cls.__qualname__}.Config: '{key}' is a section of every phase and cannot be a field")
-            phase.children[key] = section
-    root.children["callbacks"] = callbacks
-    return root
+        inner = {"losses": losses, "callbacks": callbacks} if getattr(cls, "trained", True) else {}
+        both = inner.keys() & keys_of(cls.Config).keys()
+        if both:
+            raise TypeError(f"{cls.__qualname__}.Config: '{both.pop()}' is a section of every phase and cannot be a field")
+        phases[name] = {**keys_of(cls.Config), **inner}
+    data = {"format": None, **keys_of(data_class(data_format))}
+    return {**keys_of(Options), "p2gs": None, "data": data, "phases": phases, "callbacks": callbacks}
 
 
-def _dataset(name: str):
-    from p2gs.data.base import DATASETS
-
-    if name not in DATASETS:
-        raise UserError(f"data.format: there is no '{name}'{suggest(str(name), dataset_names())}")
-    return DATASETS[name]
-
-
-def _any_data() -> Section:
-    """What a preset may say of data before a format is known: the options that every source of photographs has."""
-    from p2gs.data.base import TwoStateData
-
-    common = section_of(TwoStateData)
-    return Section(dict, {name: child for name, child in common.children.items() if name != "root"})
-
-
-def dataset_names() -> list[str]:
-    from p2gs.data.base import DATASETS
-
-    return list(DATASETS)
+def data_class(name: Optional[str]) -> type:
+    """The class of a data format; of none, the options that every source of photographs has."""
+    if name is not None and name not in DATASETS:
+        raise UserError(f"data.format: there is no '{name}'{suggest(name, list(DATASETS))}")
+    return TwoStateData if name is None else DATASETS[name]

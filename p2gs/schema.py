@@ -1,98 +1,28 @@
-"""Typed config sections built from classes: which keys there are, what type a value must have, how the object is made.
+"""Typed sections of a config: jsonargparse reads the options of a class, checks given ones, knows the defaults and makes the object.
 
-A dataclass is a section, each of its fields a key; a field of type ``Optional[<dataclass>]`` is a section that ``null`` switches
-off. Values are checked by jsonargparse, one at a time, so that a mistake is told in one line. Merging is ours, on plain dicts:
-jsonargparse (hence LightningCLI) replaces a ``dict[str, Loss]`` as a whole where it should merge, without a word.
+Merging is ours, on plain dicts: jsonargparse (hence LightningCLI) replaces a ``dict[str, Loss]`` as a whole where it should
+merge, without a word; and so is the sentence for a mistake, which names the nearest right key.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import functools
-import inspect
 import math
+import re
 import types
 import typing
-from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import Any, Callable, Iterable, Iterator, Union
+from typing import Any, Iterator, Union
+
+from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 
 from p2gs.types import UserError, short
 
 Plain = dict[str, Any]
-
-
-@dataclass
-class Leaf:
-    """A single value. ``default`` is MISSING where the user has to give one."""
-
-    type: Any
-    default: Any = MISSING
-
-
-@dataclass
-class Section:
-    """A group of keys that becomes ``make(**values)``. optional: null switches it off.  on: whether it is on when not mentioned."""
-
-    make: Callable
-    children: dict[str, Union["Section", Leaf]] = field(default_factory=dict)
-    optional: bool = False
-    on: bool = True
-
-    def walk(self, prefix: str = "") -> Iterator[str]:
-        """Every dotted key below, sections included."""
-        for name, child in self.children.items():
-            yield prefix + name
-            if isinstance(child, Section):
-                yield from child.walk(f"{prefix}{name}.")
-
-
-def section_of(cls: Callable, default: Any = MISSING) -> Section:
-    """The section of a dataclass, or of the ``__init__`` arguments of any other class (every argument needs a type)."""
-    section = Section(cls)
-    for name, hint, value in _dataclass_fields(cls, default) if dataclasses.is_dataclass(cls) else _init_arguments(cls):
-        inner, optional = _without_none(hint)
-        if dataclasses.is_dataclass(inner) and isinstance(inner, type):
-            child = section_of(inner, value if value is not MISSING and value is not None else MISSING)
-            child.optional, child.on = optional, not (optional and value is None)
-            section.children[name] = child
-        else:
-            section.children[name] = Leaf(hint, value)
-    return section
-
-
-def _dataclass_fields(cls, instance):
-    hints = typing.get_type_hints(cls)
-    for f in dataclasses.fields(cls):
-        if not f.init:
-            continue
-        if instance is not MISSING:
-            value = getattr(instance, f.name)
-        else:
-            value = f.default_factory() if f.default_factory is not MISSING else f.default
-        yield f.name, hints[f.name], value
-
-
-def _init_arguments(cls):
-    hints = typing.get_type_hints(cls.__init__)
-    for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:
-        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-            continue
-        if name not in hints:
-            raise TypeError(f"{cls.__qualname__}.__init__: argument '{name}' needs a type annotation to be settable from the config")
-        yield name, hints[name], MISSING if parameter.default is parameter.empty else parameter.default
-
-
-def _without_none(hint) -> tuple[Any, bool]:
-    if typing.get_origin(hint) in (Union, types.UnionType):
-        rest = [a for a in typing.get_args(hint) if a is not type(None)]
-        if len(rest) == 1 and len(typing.get_args(hint)) == 2:
-            return rest[0], True
-    return hint, False
-
-
-# -- merging -----------------------------------------------------------------------------------------------------------------------
+Keys = dict[str, Any]  # option names, nested as they are given; None: a single value
+IT = "it"  # where jsonargparse keeps a class's options
+set_parsing_settings(instantiate_subclass_spec_in_any=False)  # a config makes no object of a class that nothing asked for
 
 
 def merge(base: Plain, over: Plain) -> Plain:
@@ -110,26 +40,102 @@ def nested(path: str, value: Any) -> Plain:
     return value
 
 
-# -- checking ----------------------------------------------------------------------------------------------------------------------
+@functools.cache
+def _parser(cls: type) -> tuple[ArgumentParser, list[str], Namespace]:
+    """What reads a class's options, the names of those without a default (None until given), and all defaults."""
+    parser = ArgumentParser(exit_on_error=False, add_help=False)
+    parser.add_class_arguments(cls, IT)
+    needed = [action for action in parser._actions if action.required]
+    for action in needed:
+        action.required = False
+    return parser, [action.dest.partition(".")[2] for action in needed], parser.get_defaults()
 
 
-def check_keys(tree: Plain, section: Section, where: str = "") -> None:
+@functools.cache
+def keys_of(cls: type) -> Keys:
+    """The options of a dataclass, or the arguments of any other class's ``__init__``."""
+    tree: Keys = {}
+    for action in _parser(cls)[0]._actions:
+        tree = merge(tree, nested(action.dest, None))
+    return tree.get(IT) or {}
+
+
+class Given:
+    """Options of a class: those given, checked, and the defaults of the others. Raises UserError on a value of the wrong type.
+
+    path: of the section in the config, with a dot at its end.  values: every option as YAML holds it.
+    """
+
+    def __init__(self, cls: type, tree: Plain, path: str = ""):
+        self.cls, self.path = cls, path
+        parser, _, defaults = _parser(cls)
+        self._made = self._read(parser, _without_null(tree, keys_of(cls))) if tree else defaults.clone()
+        self.values: Plain = plain(self._made.as_dict().get(IT) or {})
+
+    def _read(self, parser: ArgumentParser, tree: Plain) -> Namespace:
+        try:
+            made = parser.parse_object({IT: tree})
+        except Exception as err:  # told in several lines; the user gets one
+            found = re.search(rf'"{IT}\.([\w.]+)"', str(err))
+            raise self._wrong(found[1] if found else "", tree) from err
+        for key, value in made.items():
+            if any(isinstance(x, float) and math.isnan(x) for x in (value if isinstance(value, list) else [value])):
+                raise self._wrong(key.partition(".")[2], tree)
+        return made
+
+    def _wrong(self, key: str, tree: Plain) -> UserError:
+        value = functools.reduce(lambda at, name: at.get(name) if isinstance(at, dict) else at, key.split("."), tree)
+        hints = {action.dest: getattr(action, "_typehint", None) for action in _parser(self.cls)[0]._actions}
+        return UserError(f"{self.path}{key}: expected {describe(hints.get(f'{IT}.{key}'))}, got {short(value)}")
+
+    def make(self) -> Any:
+        """A new object of the class. Raises UserError where an option without a default is not given."""
+        parser, needed, _ = _parser(self.cls)
+        for name in needed:
+            if self.values[name] is None:
+                raise UserError(f"{self.path}{name} is not given (--{self.path}{name} VALUE)")
+        return parser.instantiate(self._made.clone())[IT] if IT in self._made else self.cls()
+
+
+def _without_null(tree: Plain, keys: Keys) -> Plain:
+    """The tree without groups of options that are null: these stay at their defaults."""
+    groups = {name: inner for name, inner in keys.items() if inner is not None}
+    return {k: _without_null(v, groups[k]) if k in groups else v for k, v in tree.items() if k not in groups or v is not None}
+
+
+def plain(value: Any) -> Any:
+    """The value as YAML holds it: dicts, lists, text, numbers."""
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+# -- mistakes, told in a sentence --------------------------------------------------------------------------------------------------
+
+
+def check_keys(tree: Plain, keys: Keys, where: str = "") -> None:
     """Raise UserError at the first key that does not exist or is no section where one is needed. where: prefix of the message."""
-    _check_keys(tree, section, "", where, list(section.walk()))
+
+    def check(tree: Plain, level: Keys, path: str) -> None:
+        for name, value in tree.items():
+            here = f"{path}{name}"
+            if name not in level:
+                raise UserError(f"{where}no option '{here}'{nearest(here, list(walk(keys)))}")
+            if level[name] is not None and isinstance(value, dict):
+                check(value, level[name], here + ".")
+            elif level[name] is not None and value is not None:
+                raise UserError(f"{where}{here}: expected options (key: value) or null, got {short(value)}")
+
+    check(tree, keys, "")
 
 
-def _check_keys(tree: Plain, section: Section, prefix: str, where: str, known: list[str]) -> None:
-    for key, value in tree.items():
-        path = f"{prefix}{key}"
-        child = section.children.get(key)
-        if child is None:
-            raise UserError(f"{where}no option '{path}'{nearest(path, known)}")
-        if isinstance(child, Section):
-            if isinstance(value, dict):
-                _check_keys(value, child, path + ".", where, known)
-            elif value is not None:
-                null = " or null" if child.optional else ""
-                raise UserError(f"{where}{path}: expected options (key: value){null}, got {short(value)}")
+def walk(keys: Keys, prefix: str = "") -> Iterator[str]:
+    """Every dotted key, sections included."""
+    for name, inner in keys.items():
+        yield prefix + name
+        yield from walk(inner or {}, f"{prefix}{name}.")
 
 
 def nearest(path: str, known: list[str]) -> str:
@@ -153,89 +159,16 @@ def nearest(path: str, known: list[str]) -> str:
     return f"; known here: {', '.join(sorted(siblings))}" if siblings else ""
 
 
-def complete(tree: Plain, section: Section, prefix: str = "") -> Plain:
-    """All keys of the section with typed values: given ones checked, the others at their defaults, sections that are off None.
-
-    A required value that is missing stays ``dataclasses.MISSING`` (``build`` complains). Raises UserError on a wrong type.
-    """
-    out: Plain = {}
-    for name, child in section.children.items():
-        path = prefix + name
-        if isinstance(child, Leaf):
-            out[name] = typed(tree[name], child.type, path) if name in tree else child.default
-        elif tree.get(name) is not None:
-            out[name] = complete(tree[name], child, path + ".")
-        elif child.optional and (name in tree or not child.on):
-            out[name] = None
-        else:
-            out[name] = complete({}, child, path + ".")
-    return out
-
-
-def build(values: Plain, section: Section, prefix: str = "") -> Any:
-    """The object of a completed section. Raises UserError where a required value is missing."""
-    made = {}
-    for name, value in values.items():
-        child = section.children[name]
-        if value is MISSING:
-            raise UserError(f"{prefix}{name} is not given (--{prefix}{name} VALUE)")
-        made[name] = build(value, child, f"{prefix}{name}.") if isinstance(child, Section) and value is not None else value
-    return section.make(**made)
-
-
-@functools.cache
-def _parser(hint):
-    from jsonargparse import ArgumentParser
-
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_argument("--value", type=hint)
-    return parser
-
-
-def typed(value: Any, hint: Any, path: str) -> Any:
-    """``value`` as ``hint`` demands (text is read as the command line would give it). Raises UserError naming ``path``."""
-    parser = _parser(hint)
-    try:
-        made = parser.parse_object({"value": value}, defaults=False).value
-    except Exception as err:  # jsonargparse reports in several lines; the user gets one
-        raise UserError(f"{path}: expected {describe(hint)}, got {short(value)}") from err
-    if any(isinstance(x, float) and math.isnan(x) for x in (made if isinstance(made, list) else [made])):
-        raise UserError(f"{path}: expected {describe(hint)}, got {short(value)}")
-    return made
-
-
 def describe(hint: Any) -> str:
     """A type in words a user reads: ``a number``, ``one of a, b``, ``a whole number or null``."""
-    words = {int: "a whole number", float: "a number", str: "text", bool: "true or false", type(None): "null", Path: "a path"}
+    words: dict[Any, str] = {int: "a whole number", float: "a number", str: "text", bool: "true or false", Path: "a path"}
     if hint in words:
         return words[hint]
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
-        return f"one of {', '.join(map(str, args))}" if len(args) > 1 else f"'{args[0]}'"
+        return f"one of {', '.join(map(str, args))}" if len(args) > 1 else "".join(f"'{a}'" for a in args)
     if origin in (Union, types.UnionType):
-        return " or ".join(describe(a) for a in args)
+        return " or ".join("null" if a is type(None) else describe(a) for a in args)
     if origin in (list, tuple):
         return f"a list like [{', '.join(describe(a) if a is not Ellipsis else '...' for a in args)}]"
     return getattr(hint, "__name__", str(hint))
-
-
-def plain(value: Any) -> Any:
-    """The value as YAML holds it: dicts, lists, text, numbers. A missing required value becomes null."""
-    if value is MISSING:
-        return None
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {k: plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    return str(value) if isinstance(value, Path) else value
-
-
-def switches(classes: Iterable[tuple[str, type]]) -> Section:
-    """A section with one optional section a name, all off unless mentioned; it becomes a dict of those that are on."""
-    section = Section(lambda **made: {name: item for name, item in made.items() if item is not None})
-    for name, cls in classes:
-        section.children[name] = section_of(cls)
-        section.children[name].optional, section.children[name].on = True, False
-    return section

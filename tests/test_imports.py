@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "p2gs"
 # what is imported stands in an earlier row, or in the same one
 ORDER = [
     ("types", "registry", "stage_times", "machine", "stopping", "run_lock"),
-    ("schema", "config_files"),
+    ("schema", "config_files", "provenance"),
     ("ops", "native"),
     ("render",),
     ("losses", "metrics", "data"),

@@ -20,6 +20,7 @@ class Job(Protocol):
 
     def result(self) -> Outcome:
         """What became of it; raises where the machinery itself failed (a lost node, a job cancelled by hand)."""
+        ...
 
 
 class Executor(Protocol):

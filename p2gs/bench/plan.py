@@ -19,11 +19,11 @@ import json
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Iterable, Iterator, Literal, Optional, Union
+from typing import Iterable, Iterator, Literal, Optional, Union
 
 from p2gs.config_files import Layer, overrides_layer, parse_overrides, read_config
 from p2gs.registry import suggest
-from p2gs.schema import Leaf, Plain, Section, build, check_keys, complete, merge, section_of
+from p2gs.schema import Given, Keys, Plain, check_keys, keys_of, merge
 from p2gs.types import UserError
 
 GT = re.compile(r"gt\s*(?:([+-])\s*(\d+))?")
@@ -36,7 +36,7 @@ class Setting:
     """
 
     config: list[str] = field(default_factory=list)
-    set: dict[str, Any] = field(default_factory=dict)
+    set: dict = field(default_factory=dict)  # no types inside: of Any jsonargparse would import a class that is named
     num_parts: Optional[Union[int, str]] = None
 
 
@@ -52,7 +52,7 @@ class SlurmOptions:
     memory_gb: float = 16
     gpus: int = 0
     jobs: int = 16
-    extra: dict[str, Any] = field(default_factory=dict)
+    extra: dict = field(default_factory=dict)
 
 
 @dataclass
@@ -85,7 +85,7 @@ class BenchOptions:
     config: list[str] = field(default_factory=lambda: ["preset/cpu.yaml"])
     preset: Optional[str] = None
     num_parts: Optional[Union[int, str]] = None
-    set: dict[str, Any] = field(default_factory=dict)
+    set: dict = field(default_factory=dict)
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
     export: list[str] = field(default_factory=lambda: ["ply"])
     reuse: bool = True
@@ -334,10 +334,10 @@ def read_bench(
     objects: instead of the files' (benchmarks, ids, or scene folders below root by name).  settings: of the files', these only.
     Raises UserError.
     """
-    schema = section_of(BenchOptions)
+    keys = {**keys_of(BenchOptions), "settings": None}
     own, for_fit = [], {}
     for key, value in parse_overrides(list(words)):
-        if key.split(".")[0] in (*schema.children, "settings"):
+        if key.split(".")[0] in keys:
             own.append((key, value))
         else:
             for_fit[key] = value
@@ -345,32 +345,29 @@ def read_bench(
     layers += [overrides_layer(own), Layer({"set": for_fit})]
     tree: Plain = {}
     for layer in layers:
-        tree = merge(tree, _checked(layer.tree, schema, layer.where))
+        tree = merge(tree, _checked(layer.tree, keys, layer.where))
     given = {name: value for name, value in (tree.pop("settings", None) or {"full": {}}).items() if value is not None}
     given = {name: given[name] for name in only(settings, given, "settings")}
     if objects:
         tree["objects"] = list(objects)
-    options: BenchOptions = build(complete(tree, schema), schema)
-    one = section_of(Setting)
-    built = {name: build(complete(v, one, f"settings.{name}."), one) for name, v in given.items()}
+    options: BenchOptions = Given(BenchOptions, tree).make()
+    built = {name: Given(Setting, value, f"settings.{name}.").make() for name, value in given.items()}
     return Bench(options, built, {**tree, "settings": given})
 
 
-def _checked(tree: Plain, schema: Section, where: str) -> Plain:
+def _checked(tree: Plain, keys: Keys, where: str) -> Plain:
     """The tree, after its keys were found to exist; ``null`` for a setting removes it."""
     settings = tree.get("settings") or {}
     if not isinstance(settings, dict):
         raise UserError(f"{where}settings: expected name: {{config: [...]}}, got {settings!r}")
-    rest = {k: v for k, v in tree.items() if k != "settings"}
-    check_keys(rest, Section(dict, {**schema.children, "settings": Leaf(dict, {})}), where)
-    one = section_of(Setting)
+    check_keys(tree, keys, where)
     for name, value in settings.items():
         if not re.fullmatch(r"[\w.+-]+", str(name)):
             raise UserError(f"{where}settings: '{name}' names a folder, so letters, digits and ._+- only")
         if value is not None:
             if not isinstance(value, dict):
                 raise UserError(f"{where}settings.{name}: expected options (key: value), got {value!r}")
-            check_keys(value, one, f"{where}settings.{name}: ")
+            check_keys(value, keys_of(Setting), f"{where}settings.{name}: ")
     return tree
 
 

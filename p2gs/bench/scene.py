@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from p2gs.ops.knn import search_tree
 from p2gs.types import Camera
 
 
@@ -62,11 +63,9 @@ def _surface_samples(n: int, rng: np.random.Generator) -> np.ndarray:
 def bench_scene(n: int, px: int, seed: int = 0, scale: float = 2.0) -> BenchScene:
     """n Gaussians of about ``scale`` x the mean nearest-neighbour distance (lognormal, sigma 0.3, each axis), opacities 0.1 to 0.95,
     random rotations and degree-3 colours; a view of px x px pixels of which they cover about 40 %."""
-    from scipy.spatial import cKDTree
-
     rng = np.random.default_rng(seed)
     means = _surface_samples(n, rng)
-    spacing = cKDTree(means).query(means, 2)[0][:, 1].mean() if n > 1 else 0.1
+    spacing = search_tree(means).query(means, 2)[0][:, 1].mean() if n > 1 else 0.1
     scales = scale * spacing * rng.lognormal(0, 0.3, (n, 3))
     sh = rng.normal(0, 0.1, (n, 16, 3))
     sh[:, 0] = rng.uniform(-1, 1, (n, 3))

@@ -77,14 +77,11 @@ def silence_lightning() -> None:
     for name in ("lightning.pytorch", "lightning.fabric", "pytorch_lightning", "lightning_fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     for pattern in (
-        r".*does not have many workers.*",
-        r".*`IterableDataset` has `__len__`.*",
         r".*LeafSpec.*",
         r".*isinstance\(treespec.*",
         r".*`training_step` returned `None`.*",
         r".*Checkpoint directory .* exists and is not empty.*",
         r".*GPU available but not used.*",
-        r".*defining iterable dataset.*",
         r".*resuming from a checkpoint that ended before the epoch ended.*",
     ):
         warnings.filterwarnings("ignore", message=pattern)

@@ -9,8 +9,9 @@ A new source is a subclass with one method, ``read()``, registered by name::
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
-from typing import Iterator, Literal, Optional, Sequence, TypeVar
+from typing import Any, Iterator, Literal, NamedTuple, Optional, Sequence, Sized, TypeVar
 
 import numpy as np
 from lightning.pytorch import LightningDataModule
@@ -27,29 +28,34 @@ Shot = TypeVar("Shot", Frame, View)
 DATASETS: Registry[type["TwoStateData"]] = Registry("data format")
 
 
-class ViewLoader:
-    """An endless loader of ``(step, view)`` pairs, addressed by step so that a resumed run sees what an unbroken one would.
+class Visit(NamedTuple):
+    """Which photograph a step looks at. step: of the phase, from 0.  state: 0 or 1.  view: its number among the state's training views."""
 
-    n_views: views to choose from.  seed: of the order.  length: batches in a Lightning epoch (default: one pass over the views).
-    ``state_dict`` holds the next step; Lightning saves and restores it with the checkpoint.
+    step: int
+    state: int = 0
+    view: int = 0
+
+
+class ViewLoader:
+    """The batches of a phase: an endless row of visits, each a pure function of (seed, step), so that a resumed run sees what an unbroken
+    one would.
+
+    views: training views of each state that the phase looks at; the states take turns, and each view comes once before any comes twice.
+    None (a phase that renders no photograph): the step alone.  seed: of the order.  first: the step to begin at.
     """
 
-    def __init__(self, n_views: int, seed: int = 0, length: Optional[int] = None):
-        self.n_views, self.seed, self.length, self.step = n_views, seed, length or n_views, 0
+    def __init__(self, views: dict[int, int], seed: int = 0, first: int = 0):
+        self.views, self.seed, self.first = views, seed, first
 
-    def __len__(self) -> int:
-        return self.length
+    def __getitem__(self, step: int) -> Visit:
+        if not self.views:
+            return Visit(step)
+        turn, which = divmod(step, len(self.views))
+        state = sorted(self.views)[which]
+        return Visit(step, state, view_index(self.seed + 7919 * state, turn, self.views[state]))
 
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        while True:
-            step, self.step = self.step, self.step + 1
-            yield step, view_index(self.seed, step, self.n_views)
-
-    def state_dict(self) -> dict:
-        return {"step": self.step}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.step = int(state["step"])
+    def __iter__(self) -> Iterator[Visit]:
+        return (self[step] for step in itertools.count(self.first))
 
 
 class TwoStateData(LightningDataModule):
@@ -60,7 +66,7 @@ class TwoStateData(LightningDataModule):
         downscale: images are divided by this factor in width and height when read (1 = as on disk).
         max_views: at most so many training views a state, a farthest-point subset of the cameras (None = all).
         depth: ``auto`` reads depth where it is there, ``never`` leaves it out, ``always`` demands it.
-        seed: of the order in which views are visited.
+        seed: of the order in which phases visit views, beside the run's.
         normalize: ``object`` trains with the object's box (found from the masks) centred and 2 units in diagonal, ``none`` as on disk.
 
     strict_paths: the run's; files that lead out of ``root`` are refused, not only named.
@@ -84,7 +90,8 @@ class TwoStateData(LightningDataModule):
             raise UserError(f"data.max_views is {max_views}, but it must be at least 1")
         self.root: Optional[str] = root
         self.downscale, self.max_views = downscale, max_views
-        self.depth, self.seed, self.normalize = depth, seed, normalize
+        self.depth: DepthMode = depth
+        self.seed, self.normalize = seed, normalize
         self._files: Optional[list[Path]] = None
         self._raw: Optional[TwoStateScene] = None
         self._scene: Optional[TwoStateScene] = None
@@ -133,8 +140,14 @@ class TwoStateData(LightningDataModule):
         self.scene()
 
     def train_dataloader(self) -> ViewLoader:
-        """``(step, view)`` over the training views of both states (start's first), in the order of ``scene().select(split="train")``."""
-        return ViewLoader(len(self.scene().select(split="train")), self.seed)
+        """The visits of the phase in training from the step that it has reached."""
+        assert self.trainer is not None  # Lightning asks for the loader when it has attached the trainer
+        phase: Any = self.trainer.lightning_module
+        return self.visits(phase.views, phase.seed, phase.step)
+
+    def visits(self, views: dict[int, Sized], seed: int, first: int = 0) -> ViewLoader:
+        """The visits of a phase of that seed which looks at these views of each state, beginning at step ``first``."""
+        return ViewLoader({state: len(of) for state, of in views.items()}, seed + 104729 * self.seed, first)
 
 
 def with_box(scene: TwoStateScene) -> TwoStateScene:

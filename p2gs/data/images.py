@@ -156,6 +156,7 @@ def _read_alpha(frame: Frame, image: np.ndarray, report: Report) -> Optional[np.
 
 
 def _read_depth(frame: Frame, shape: tuple[int, int], report: Report) -> Optional[np.ndarray]:
+    assert frame.depth is not None
     depth = _decode(frame.depth, report)
     if depth is None:
         return None

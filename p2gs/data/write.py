@@ -39,6 +39,7 @@ def _bgra(view: View) -> np.ndarray:
 
 
 def _millimetres(view: View) -> np.ndarray:
+    assert view.depth is not None
     return np.rint(view.depth.numpy().astype(np.float64) * 1000).astype(np.uint16)
 
 

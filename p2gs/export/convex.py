@@ -12,6 +12,7 @@ from typing import Optional
 import numpy as np
 
 from p2gs.export.unique_rows import unique_rows
+from p2gs.ops.knn import search_tree
 
 POINTS = 12000  # of the surface that the pieces are made from
 CELLS = 12  # along the longest side; 8 left hulls 15 % farther from the surface
@@ -72,8 +73,6 @@ def outermost(points: np.ndarray) -> np.ndarray:
 
 def spread(vertices: np.ndarray, count: int = POINTS) -> tuple[np.ndarray, float]:
     """About ``count`` of the vertices, evenly over the surface, and their spacing: one vertex in each cell of a grid."""
-    from scipy.spatial import cKDTree
-
     lo, size = vertices.min(0), float(np.ptp(vertices, axis=0).max())
     cell = size / 400
     while True:
@@ -81,7 +80,7 @@ def spread(vertices: np.ndarray, count: int = POINTS) -> tuple[np.ndarray, float
         first = unique_rows(key)[0]
         if len(first) <= count or cell > size:
             points = vertices[np.sort(first)]
-            gaps = cKDTree(points).query(points, k=2)[0][:, 1] if len(points) > 1 else np.zeros(1)
+            gaps = search_tree(points).query(points, k=2)[0][:, 1] if len(points) > 1 else np.zeros(1)
             return points, max(cell, float(np.quantile(gaps, 0.9)))
         cell *= 1.25
 

@@ -17,6 +17,7 @@ from p2gs.export.depth_view import DepthView
 from p2gs.export.faces import Faces
 from p2gs.export.unique_rows import unique_rows
 from p2gs.export.unseen import NEAR, seen_empty, sewn
+from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh, connected
 
 LEAST = 0.1  # share of the largest piece's area that a piece has
@@ -78,8 +79,6 @@ def join_pieces(mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses:
 
     Of two ways the one that they contradict less.  views, poses, voxel: as in ``close_unseen_sides``, of the sliding part.
     """
-    from scipy.spatial import cKDTree
-
     if len(mesh.faces) == 0:
         return mesh
     pieces = [Piece(p, axis, voxel) for p in connected(mesh)]
@@ -87,7 +86,7 @@ def join_pieces(mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses:
     pieces = sorted((p for p in pieces if p.area > LEAST * most), key=lambda p: p.lo)
     if len(pieces) < 2:
         return mesh
-    seen, out = cKDTree(mesh.vertices), mesh
+    seen, out = search_tree(mesh.vertices), mesh
     for left, right in zip(pieces, pieces[1:], strict=False):
         ways = []
         for added in (bridge(left, right, drawn) for drawn in (left, right)):

@@ -11,6 +11,7 @@ import torch
 
 from p2gs.export.pose import pose
 from p2gs.export.sightings import RESOLUTION, sight
+from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh
 from p2gs.types import ArticulatedObject, Camera, Part, UserError
 
@@ -66,9 +67,8 @@ def _largest_component(points: np.ndarray, eps: float) -> np.ndarray:
     """[N] bool."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
 
-    pairs = cKDTree(points).query_pairs(eps, output_type="ndarray")
+    pairs = search_tree(points).query_pairs(eps, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     label = connected_components(graph, directed=False)[1]
     return label == np.bincount(label).argmax()

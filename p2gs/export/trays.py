@@ -17,6 +17,7 @@ from torch import Tensor
 from p2gs.export.depth_view import DepthView
 from p2gs.export.faces import Faces, quantile
 from p2gs.export.unseen import NEAR, facing, grid_plane, seen_empty, sewn
+from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh
 
 FLAT = 0.8  # cosine with a direction from which a triangle faces it
@@ -225,10 +226,8 @@ def complete_tray(mesh: Mesh, tray: Tray, views: Sequence[DepthView], poses: Seq
 
     views, poses, voxel, clearance: as in ``close_unseen_sides``, of the sliding part.
     """
-    from scipy.spatial import cKDTree
-
     mesh = _without_strays(mesh, tray, NEAR * voxel)
-    seen, colours = cKDTree(mesh.vertices), mesh.colours
+    seen, colours = search_tree(mesh.vertices), mesh.colours
     for axis, e in ((1, 0), (1, 1), (2, 0), (2, 1), (0, 0)):
         if (axis - 1, e) == tray.mouth:
             continue

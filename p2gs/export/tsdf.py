@@ -16,6 +16,7 @@ from torch import Tensor
 
 from p2gs.export.depth_view import DepthView, pixel_matrix, seen_points
 from p2gs.export.integrate import integrate
+from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh
 
 BLOCK = 4  # voxels; active space is kept in cubes of this side
@@ -68,7 +69,6 @@ class ActiveGrid:
     def surface(self, field: Tensor, seen: Tensor, colour: Tensor) -> Mesh:
         """Zero crossing of field [M] over the cells whose eight corners are seen [M]; colours [M, 3] in 0..1 carried along."""
         from scipy.ndimage import map_coordinates
-        from scipy.spatial import cKDTree
         from skimage.measure import marching_cubes
 
         i = tuple(self.index[seen].T.numpy())
@@ -96,7 +96,7 @@ class ActiveGrid:
         painted = rgb[:, 3] > 1e-6  # not where pinholes were filled
         rgb = rgb[:, :3] / np.maximum(rgb[:, 3:], 1e-6)
         if painted.any() and not painted.all():
-            rgb[~painted] = rgb[painted][cKDTree(vertices[painted]).query(vertices[~painted])[1]]
+            rgb[~painted] = rgb[painted][search_tree(vertices[painted]).query(vertices[~painted])[1]]
         world = self.origin.numpy() + vertices.astype(np.float64) * self.voxel
         return Mesh(world, faces.astype(np.int64), (np.clip(rgb, 0, 1) * 255).round().astype(np.uint8))
 

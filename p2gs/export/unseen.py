@@ -17,6 +17,7 @@ from p2gs.export.depth_view import DepthView, pixel_matrix, pixels, seen_points
 from p2gs.export.plinth import plinth_height
 from p2gs.export.unique_rows import unique_rows
 from p2gs.ops import se3
+from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh
 
 NEAR = 4.0  # voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges
@@ -54,14 +55,12 @@ def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[T
 
     mesh, poses: start-state coordinates of the part (its number in ``views``).  voxel: of the mesh.  clearance: as in ``seen_empty``.
     """
-    from scipy.spatial import cKDTree
-
     if len(mesh.faces) == 0:
         return mesh
     # the mesh goes on for a voxel or two beyond the edges of what was seen
     seen = torch.cat([seen_points(v, part, T, stride=2) for v, T in zip(views, poses, strict=True)]).numpy()
     lo, hi = np.quantile(seen, 0.002, axis=0), np.quantile(seen, 0.998, axis=0)
-    tree, planes, eyes = cKDTree(mesh.vertices), [], eyes_of(views, poses)
+    tree, planes, eyes = search_tree(mesh.vertices), [], eyes_of(views, poses)
     for axis in range(3):
         across = [i for i in range(3) if i != axis]
         shape = [max(2, round((hi[i] - lo[i]) / voxel) + 1) for i in across]
@@ -116,12 +115,10 @@ def _open_vertices(faces: np.ndarray) -> np.ndarray:
 
 def sewn(mesh: Mesh, plane: Mesh, reach: float) -> Mesh:
     """Both as one; the plane's rim takes the vertices of the mesh's open edges where these are within ``reach``."""
-    from scipy.spatial import cKDTree
-
     rim, edge = _open_vertices(plane.faces), _open_vertices(mesh.faces)
     index = np.arange(len(plane.vertices)) + len(mesh.vertices)
     if len(rim) and len(edge):
-        distance, nearest = cKDTree(mesh.vertices[edge]).query(plane.vertices[rim])
+        distance, nearest = search_tree(mesh.vertices[edge]).query(plane.vertices[rim])
         index[rim[distance < reach]] = edge[nearest[distance < reach]]
     faces = index[plane.faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]

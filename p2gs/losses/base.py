@@ -68,7 +68,7 @@ class PartState:
     probs: Tensor
     means_canonical: Tensor
     transforms: Tensor
-    canonical_time: float
+    canonical_time: float | Tensor
     extent: float
     spacing: float
     pairs: Optional[Tensor] = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,10 +40,11 @@ def select_pairs(inputs: LossInputs, sample: int) -> Pairs | None:
 
 def unexplained(inputs: LossInputs, sample: int) -> Tensor:
     """What every part's motion leaves of the pairs of ``select_pairs``: R_k mu0 + t_k - mu1, [K, 3, M]."""
-    pairs, shared, key = select_pairs(inputs, sample), inputs.parts.shared, ("unexplained", sample, inputs.step)
-    if key not in shared:
-        shared[key] = carried(inputs.parts.transforms, pairs.mu0) - pairs.mu1.T
-    return shared[key]
+    parts, pairs, key = inputs.parts, select_pairs(inputs, sample), ("unexplained", sample, inputs.step)
+    assert parts is not None and pairs is not None  # who asks has seen that there are some
+    if key not in parts.shared:
+        parts.shared[key] = carried(parts.transforms, pairs.mu0) - pairs.mu1.T
+    return parts.shared[key]
 
 
 def carried(transforms: Tensor, points: Tensor) -> Tensor:
@@ -82,12 +83,12 @@ class Vector(Loss):
     robust: float | None = None
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
-        pairs = select_pairs(inputs, self.sample)
-        if pairs is None:
+        parts, pairs = inputs.parts, select_pairs(inputs, self.sample)
+        if parts is None or parts.pairs is None or pairs is None:
             return None
-        cost = squared(unexplained(inputs, self.sample), self.robust, inputs.parts.extent, dim=1)
+        cost = squared(unexplained(inputs, self.sample), self.robust, parts.extent, dim=1)
         per_pair = (pairs.probs.T * cost).sum(0)
-        return reduce_pairs(per_pair, self.reduce, len(inputs.parts.pairs))
+        return reduce_pairs(per_pair, self.reduce, len(parts.pairs))
 
 
 @register_loss("art")
@@ -130,10 +131,9 @@ class Art(Loss):
     robust: float | None = None
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
-        pairs = select_pairs(inputs, self.sample)
-        if pairs is None:
+        parts, pairs = inputs.parts, select_pairs(inputs, self.sample)
+        if parts is None or parts.pairs is None or pairs is None:
             return None
-        parts = inputs.parts
         if self.source == "observed":
             moved = carried(parts.transforms, pairs.mu0)
         else:
@@ -164,7 +164,7 @@ class Art(Loss):
         """F [N, 3] at points [N, 3] from repel_points [R, 3], at most ``tau`` long, all in scene units."""
         if repel_points is None or len(repel_points) == 0 or self.k_r == 0 or tau <= 0:
             return torch.zeros_like(points)
-        law = {"exponent": self.exponent, "eps": self.eps, "tau_max": tau}
+        law: dict[str, Any] = {"exponent": self.exponent, "eps": self.eps, "tau_max": tau}
         if self.variant == "paper":
             force = repel_force(points, repel_points, k_r=self.k_r, reduce="sum", **law)
         else:

@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
+from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh, Triangles, largest_components
 
 POINTS = 10_000
@@ -60,7 +61,8 @@ def read_mesh(path: Path | str | None) -> Triangles | None:
     """A mesh file that trimesh reads (ply, obj, stl, glb), scene graphs joined; None for no path or no such file."""
     import trimesh
 
-    return trimesh.load(path, force="mesh", process=False) if path is not None and Path(path).is_file() else None
+    loaded: Any = trimesh.load  # of a file it makes what ``force`` says
+    return loaded(path, force="mesh", process=False) if path is not None and Path(path).is_file() else None
 
 
 def read_part_meshes(whole: Path | str | None, static: Path | str | None, movable: Sequence[Path | str | None]) -> PartMeshes:
@@ -112,10 +114,8 @@ def chamfer_distance(a: np.ndarray, b: np.ndarray) -> float:
     >>> chamfer_distance(np.zeros((1, 3)), np.array([[1.0, 0, 0], [2.0, 0, 0]]))
     3.5
     """
-    from scipy.spatial import cKDTree
-
-    ab, _ = cKDTree(b).query(a)
-    ba, _ = cKDTree(a).query(b)
+    ab, _ = search_tree(b).query(a)
+    ba, _ = search_tree(a).query(b)
     return float((ab**2).mean() + (ba**2).mean())
 
 
@@ -183,19 +183,20 @@ def evaluate_chamfer(
     """
 
     def score(p: Triangles | None, g: Triangles | None) -> float | None:
-        return None if is_empty(p) or is_empty(g) else mesh_chamfer(p, g, count, seeds)
+        return None if p is None or g is None or is_empty(p) or is_empty(g) else mesh_chamfer(p, g, count, seeds)
 
-    def cleaned(mesh: Triangles | None) -> Triangles | None:
-        return mesh if mesh is None or clean <= 0 else largest_components(Mesh.of(mesh), clean, weld=True)
+    def cleaned(mesh: Triangles) -> Triangles:
+        return mesh if clean <= 0 else largest_components(Mesh.of(mesh), clean, weld=True)
 
     def floor(meshes: Sequence[Triangles | None]) -> list[float]:
-        return [mesh_chamfer(g, g, count, seeds) for g in meshes if not is_empty(g)]
+        return [mesh_chamfer(g, g, count, seeds) for g in meshes if g is not None and not is_empty(g)]
 
     static, whole, parts = [], [], []
     floors = {"static": [], "movable": [], "whole": []}
     for state, truth in gt.items():
         made = pred[state]
-        found = PartMeshes(cleaned(made.static), [cleaned(m) for m in made.movable], cleaned(made.whole))
+        static_part, all_parts = (None if m is None else cleaned(m) for m in (made.static, made.whole))
+        found = PartMeshes(static_part, [cleaned(m) for m in made.movable], all_parts)
         static.append(score(found.static, truth.static))
         whole.append(score(found.all, truth.all))
         partners = [found.movable[assignment[i]] if i in assignment else None for i in range(len(truth.movable))]

@@ -188,8 +188,9 @@ def evaluate_joints(pred: Sequence[JointLike], gt: Sequence[JointLike], assignme
     scores = []
     for i, g in enumerate(gt):
         j = assignment.get(i)
-        right = j is not None and pred[j].type == g.type
-        scores.append(JointScore(i, g.type, j, None if j is None else pred[j].type, joint_errors(pred[j], g) if right else None))
+        found = None if j is None else pred[j]
+        errors = joint_errors(found, g) if found is not None and found.type == g.type else None
+        scores.append(JointScore(i, g.type, j, None if found is None else found.type, errors))
     good = [(s.type, s.errors) for s in scores if s.errors is not None]
     return JointReport(
         joints=scores,

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from p2gs.ops import se3, so3
+from p2gs.ops.knn import search_tree
 from p2gs.types import ArticulatedObject, GaussianTensors
 
 CUTOFF = 3.0
@@ -22,14 +23,12 @@ CUTOFF = 3.0
 @torch.no_grad()
 def occupancy(static: GaussianTensors, points: Tensor) -> Tensor:
     """1 - prod_i (1 - a_i(x)) at points [N, 3] -> [N] float64 in [0, 1]."""
-    from scipy.spatial import cKDTree
-
     x = points.detach().cpu().double()
     transparency = torch.zeros(len(x), dtype=torch.float64)
     if len(x) == 0 or len(static) == 0:
         return transparency
     means, scales = static.means.detach().cpu().double(), static.log_scales.detach().cpu().double().exp()
-    near = cKDTree(x.numpy()).query_ball_point(means.numpy(), (CUTOFF * scales.amax(1)).numpy())
+    near = search_tree(x.numpy()).query_ball_point(means.numpy(), (CUTOFF * scales.amax(1)).numpy())
     i = torch.repeat_interleave(torch.tensor([len(n) for n in near]))
     if len(i) == 0:
         return transparency

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from p2gs.data.base import Visit
 from p2gs.losses.base import Loss, LossInputs, PartState
 from p2gs.models.canonical import carry
 from p2gs.models.context import RunContext
@@ -98,6 +99,11 @@ class ArticulationPhase(ImagePhase):
     uses = ("sharpened", "motions")
     gives = "learned"
 
+    times: Tensor
+    repel_points: Tensor
+    knn_index: Tensor
+    spacing: Tensor
+
     @classmethod
     def build(cls, run: RunContext, section, *, states, canonical, sharpened=None, motions=None) -> "ArticulationPhase":
         if motions is None and section.config.init == "discovery":
@@ -128,6 +134,7 @@ class ArticulationPhase(ImagePhase):
         check_losses(config, losses, canonical)
         labels = canonical.labels
         if config.init == "discovery":
+            assert motions is not None  # ``build`` has seen to it
             labels, transforms = add_spare(labels, motions.transforms, num_parts - 1 - len(motions), self.generator(0, 6))
             spare = len(transforms) - len(motions)
             self.types, self.confidence = [*motions.types, *["free"] * spare], torch.cat([motions.confidence, torch.zeros(spare)])
@@ -172,9 +179,9 @@ class ArticulationPhase(ImagePhase):
         return exponential(self.config.temperature, self.config.temperature_end, fraction)
 
     # -- one step -------------------------------------------------------------------------------------------------------------
-    def inputs(self, step: int) -> LossInputs:
-        state = step % 2
-        camera, target = self.target(step // 2, state)
+    def inputs(self, visit: Visit) -> LossInputs:
+        step, state = visit.step, visit.state
+        camera, target = self.target(visit)
         g = self.splats.tensors()
         probs = self.head(self.splats.psi, self.temperature(step))
         moved = blend_move(g, probs, self.screws.twists(state - self.times))
@@ -187,7 +194,7 @@ class ArticulationPhase(ImagePhase):
 
     def repel_force(self, points: Tensor, step: int) -> Tensor:
         """The force of the loss ``art`` at points [N, 3] of any state (the repel points lie on the base, which does not move)."""
-        art = self.losses["art"]
+        art: Any = self.losses["art"]
         return art.force(points, self.repel_points, self.extent, art.tau(self.extent, step, self.total_steps))
 
     def refresh(self, step: int, g: GaussianTensors, probs: Tensor) -> None:
@@ -281,6 +288,7 @@ class ArticulationPhase(ImagePhase):
         for t in times:
             posed = carry(g, labels, self.screws.at(t - self.times))
             out = render_gaussians(posed, shot.camera, torch.ones(3, device=device), features=colours, backend=self.rasterizer)
+            assert out.features is not None
             painted = out.features + (1 - out.alpha[..., None])
             strips["rgb"].append(out.colour)
             strips["parts"].append(painted)

@@ -159,7 +159,7 @@ def _fuse_chords(g0, g1, motions, solid, betas, start_is_rich, config, num_parts
     n = len(i) + len(kept)
     g = GaussianTensors.cat([pairs, kept])
     new_labels, new_margin = torch.zeros(n, dtype=torch.int64), torch.zeros(n)
-    if labels is not None:
+    if labels is not None and margin is not None:
         new_labels = torch.cat([labels[0][i], labels[state][rest]])
         new_margin = torch.cat([margin[0][i], margin[state][rest]])
     offsets = torch.zeros(n, 2, 3)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from p2gs.data.base import Visit
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.canonical import CanonicalConfig, fuse, keep_rows, with_static
 from p2gs.models.context import RunContext
@@ -48,6 +49,9 @@ class CanonicalFusionPhase(ImagePhase):
     uses = ("sharpened", "motions")
     gives = "canonical"
 
+    betas: Tensor
+    transforms: Tensor
+
     @classmethod
     def build(cls, run: RunContext, section, *, states, sharpened=None, motions=None) -> "CanonicalFusionPhase":
         """``states`` tell what free space says: an overfitted lid explains noise that no wall behind it does."""
@@ -85,9 +89,9 @@ class CanonicalFusionPhase(ImagePhase):
         hidden = None
         if stacks is not None and motions is not None and config.canonical.hidden > 0:
             away = (motions.transforms, se3.inverse(motions.transforms))
-            hidden = tuple(
-                hidden_share(s.gaussians.means, motions.labels[i], away[i], stacks[1 - i], SURFACE) for i, s in enumerate(states)
-            )
+            labels = motions.labels
+            shares = [hidden_share(s.gaussians.means, labels[i], away[i], stacks[1 - i], SURFACE) for i, s in enumerate(states)]
+            hidden = (shares[0], shares[1])
         fused = fuse(states[0].gaussians, states[1].gaussians, motions, config.canonical, hidden, num_parts)
         if stacks is not None and motions is not None and fused.offsets is None and config.canonical.free_space > 0:
             T, tau = with_static(motions.transforms), config.canonical.free_space
@@ -120,13 +124,10 @@ class CanonicalFusionPhase(ImagePhase):
             self.moves = [RigidMoves(self.splats.labels, se3.screw_at(self.transforms, s - (1 - self.betas[1:]))) for s in (0, 1)]
         return g.placed(*self.moves[state](g.means, g.quats))
 
-    def inputs(self, step: int) -> LossInputs:
-        state = step % 2
-        camera, target = self.target(step // 2, state)
-        g = self.posed(state)
-        return LossInputs(
-            step, self.total_steps, self.splats.tensors(), self.render(g, camera, target.background), target, camera, cache=self.loss_cache
-        )
+    def inputs(self, visit: Visit) -> LossInputs:
+        camera, target = self.target(visit)
+        render = self.render(self.posed(visit.state), camera, target.background)
+        return LossInputs(visit.step, self.total_steps, self.splats.tensors(), render, target, camera, cache=self.loss_cache)
 
     def hand_over(self) -> CanonicalGaussians:
         s = self.splats

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Sequence
+
 import torch
 from torch import Tensor
 
@@ -43,7 +45,7 @@ def object_window(view: View, size: int, margin: float = 0.06) -> Camera:
 
 
 def gather_evidence(
-    g: GaussianTensors, views: list[View], size: int, min_opacity: float, backend: str = "auto", device="cpu"
+    g: GaussianTensors, views: Sequence[View], size: int, min_opacity: float, backend: str = "auto", device="cpu"
 ) -> StateEvidence:
     """Evidence of one state: centres and colours of its solid Gaussians, depth and alpha maps of its training views.
 

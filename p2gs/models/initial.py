@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Sequence
+
 import torch
 from torch import Tensor
 
@@ -23,6 +25,7 @@ def initial_points(scene: TwoStateScene, state: int, count: int, init: str, gene
         points, colours = depth_points(views, count, generator)
         if len(points) > 100:
             return points, colours
+    assert scene.box is not None  # every scene that is trained on has one
     low, high = scene.box
     found, tries = [], 0
     while sum(map(len, found)) < count and tries < 50:
@@ -35,7 +38,7 @@ def initial_points(scene: TwoStateScene, state: int, count: int, init: str, gene
     return points, torch.full((count, 3), 0.5)
 
 
-def inside_masks(points: Tensor, views: list[View], size: int = 100) -> Tensor:
+def inside_masks(points: Tensor, views: Sequence[View], size: int = 100) -> Tensor:
     """Which points [N, 3] lie inside the grown masks of at least ``HULL_SHARE`` of the views that have them in the image, [N] bool."""
     seen, inside = torch.zeros(len(points)), torch.zeros(len(points))
     for view in views:

@@ -18,7 +18,8 @@ def part_pulls(means: Tensor, quats: Tensor, parts: Parts, centres: Tensor, limi
     least cosine): Gaussians that look at ``eye`` with a smaller cosine (``facing``) have no say.
     float32 on the CPU takes native code, anything else ``part_pulls_reference``.
     """
-    maps = [t for t in (means, quats, means.grad, quats.grad, *(limit[:1] if limit else ()))]
+    assert means.grad is not None and quats.grad is not None
+    maps = [means, quats, means.grad, quats.grad, *(limit[:1] if limit else ())]
     if native is None or any(t.dtype != torch.float32 or t.device.type != "cpu" for t in maps):
         return part_pulls_reference(means, quats, parts, centres, limit)
     kept = [t.detach().contiguous() for t in maps]
@@ -35,11 +36,12 @@ def part_pulls(means: Tensor, quats: Tensor, parts: Parts, centres: Tensor, limi
 def part_pulls_reference(means: Tensor, quats: Tensor, parts: Parts, centres: Tensor, limit: Limit | None = None) -> Tensor:
     """``part_pulls`` in torch, on any device."""
     rows, part = parts.rows, parts.labels[parts.rows] - 1
-    at = [means.detach()[rows], quats.detach()[rows], means.grad[rows], quats.grad[rows]]
-    pulls = torch.cat(tangent_gradient(*at, centres.double().to(means.device)[part]), 1)
+    assert means.grad is not None and quats.grad is not None
+    at, turned = means.detach()[rows], quats.detach()[rows]
+    pulls = torch.cat(tangent_gradient(at, turned, means.grad[rows], quats.grad[rows], centres.double().to(means.device)[part]), 1)
     if limit:
         seen_from, turns, eye, least = limit
-        pulls = pulls * (facing(seen_from[rows], turns.to(means)[part], at[0], eye) >= least)[:, None]
+        pulls = pulls * (facing(seen_from[rows], turns.to(means)[part], at, eye) >= least)[:, None]
     return pulls.new_zeros(len(centres), 6).index_add_(0, part, pulls).cpu()
 
 

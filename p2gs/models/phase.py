@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +9,9 @@ from typing import Any
 import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset
 
+from p2gs.data.base import Visit
+from p2gs.data.views import TrainingViews
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.adam import NamedAdam
 from p2gs.models.health import check_gaussians, check_loss
@@ -32,18 +32,6 @@ class PhaseConfig:
     steps: int = 1000
 
 
-class _Steps(IterableDataset):
-    """Endless: a phase chooses its view from (seed, step), so a batch says nothing."""
-
-    def __iter__(self):
-        return itertools.repeat(0)
-
-
-def endless_steps() -> DataLoader:
-    """The loader of every phase's Trainer: it only ticks, ``max_steps`` ends it."""
-    return DataLoader(_Steps(), batch_size=None, num_workers=0)
-
-
 def exponential(start: float, end: float, fraction: float) -> float:
     """start at 0, end at 1, geometric between (both > 0)."""
     return math.exp(math.log(start) + (math.log(end) - math.log(start)) * min(max(fraction, 0.0), 1.0))
@@ -53,11 +41,12 @@ class Phase(LightningModule, Stage):
     """One training phase. Owns its Gaussians, rasterizer and whatever else it learns; hands over a small saved object.
 
     Subclasses give ``build`` (see ``models.stage``), ``parameter_groups`` (name -> (tensors, learning rate)),
-    ``learning_rates(step)`` and ``inputs(step)``; the sum of the losses on those inputs is minimised with one Adam. Which
-    losses are on is the config's business.
+    ``learning_rates(step)`` and ``inputs(visit)``; the sum of the losses on those inputs is minimised with one Adam. Which
+    losses are on is the config's business. It trains from the run's LightningDataModule.
 
-    losses: name -> Loss.  scalars: latest detached values by name, for callbacks to log.  seed: makes every random choice a
-    pure function of (seed, step), so that a resumed run goes the same way.
+    views: the photographs it looks at, of each state; none in a phase that renders none.  losses: name -> Loss.
+    scalars: latest detached values by name, for callbacks to log.  seed: makes every random choice a pure function of
+    (seed, step), so that a resumed run goes the same way.
     """
 
     Config: type[PhaseConfig] = PhaseConfig
@@ -66,11 +55,12 @@ class Phase(LightningModule, Stage):
     def __init__(self, config: PhaseConfig, losses: dict[str, Loss], *, seed: int = 0, rasterizer: str = "auto"):
         super().__init__()
         self.automatic_optimization = False
-        self.config = config
+        self.config: Any = config  # of the subclass's Config
         self.losses = losses
         self.seed = seed
         self.rasterizer = rasterizer
         self.splats: Splats
+        self.views: dict[int, TrainingViews] = {}
         self.scalars: dict[str, Tensor | float] = {}
         self.loss_cache: dict = {}
         self.track_gradients = False  # set by the densification callback
@@ -84,8 +74,8 @@ class Phase(LightningModule, Stage):
         """Learning rates that change with the step; groups not named keep theirs."""
         return {}
 
-    def inputs(self, step: int) -> LossInputs:
-        """Render what this step looks at."""
+    def inputs(self, visit: Visit) -> LossInputs:
+        """Render what this step looks at: the batch that the data module's loader has for it."""
         raise NotImplementedError
 
     def hand_over(self) -> Any:
@@ -148,32 +138,31 @@ class Phase(LightningModule, Stage):
     def on_train_start(self):
         leave_if_asked()
 
-    def training_step(self, batch, batch_idx):
+    def training_step(self, batch: Visit, batch_idx):
+        assert batch.step == self.step, f"the loader is at step {batch.step}, {self.phase_name} at {self.step}"
         with serial_torch(draws_natively(self.splats.means, self.rasterizer)):
-            self.one_step()
+            self.one_step(batch)
 
-    def one_step(self) -> None:
+    def one_step(self, visit: Visit) -> None:
         """Render, losses, backward pass, optimiser. Raises UserError where no Gaussian is left and where the loss is not finite."""
-        step = self.step
+        step = visit.step
         check_gaussians(self.phase_name, len(self.splats))
-        optimizer = self.optimizers()
+        optimizer: Any = self.optimizers()  # the one
         rates = self.learning_rates(step)
         for group in optimizer.param_groups:
             if group["name"] in rates:
                 group["lr"] = rates[group["name"]]
-        inputs = self.inputs(step)
+        inputs = self.inputs(visit)
         optimizer.zero_grad(set_to_none=True)
         total = self.total_loss(inputs)
         check_loss(self.phase_name, step, self.scalars)
         total.backward()
-        if self.track_gradients and inputs.render is not None and inputs.render.means2d_abs_grad is not None:
+        render = inputs.render
+        if self.track_gradients and render is not None and render.means2d_abs_grad is not None and render.radii is not None:
             # in units of the full image, so that levels of the resolution schedule weigh alike
-            self.splats.note_gradients(inputs.render.means2d_abs_grad, inputs.render.radii, float(inputs.render.alpha.shape[0]))
+            self.splats.note_gradients(render.means2d_abs_grad, render.radii, float(render.alpha.shape[0]))
         self.constrain_gradients()
         optimizer.step()
 
     def constrain_gradients(self) -> None:
         """Hook between backward and the optimiser's step."""
-
-    def train_dataloader(self):
-        return endless_steps()

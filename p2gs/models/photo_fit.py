@@ -82,6 +82,7 @@ def fit_photographs(
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         loss = compare(side, *kept[turn, index], se3.exp(twist) @ transform, backend)
         loss.backward()
+        assert twist.grad is not None
         first = 0.9 * first + 0.1 * twist.grad
         second = 0.99 * second + 0.01 * twist.grad**2
         direction = first / (1 - 0.9 ** (step + 1)) / ((second / (1 - 0.99 ** (step + 1))).sqrt() + 1e-12)

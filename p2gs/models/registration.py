@@ -77,7 +77,8 @@ def align_states(
     T = found.transform if config.motion == "auto" else still
     tolerance = 4 * (surfels[0].noise ** 2 + surfels[1].noise ** 2) ** 0.5 + 2e-3 * diagonal
     pair = Pair(states[0].gaussians, states[1].gaussians, views, tolerance, backend)
-    fitted, judged = zip(*(held_out(len(views[s])) for s in (1, 0)), strict=True)
+    held = [held_out(len(views[s])) for s in (1, 0)]
+    fitted, judged = [h[0] for h in held], [h[1] for h in held]
     gain = pair.end_gain(T, fitted[0], config.levels[0]) if config.gain == "auto" else dark
     for size in config.levels if config.motion == "auto" else ():
         T = fit_photographs(pair.sides(gain), T, fitted, config.steps, size, tolerance, backend=backend)
@@ -160,6 +161,7 @@ class RegistrationStage(Stage):
     @classmethod
     def compute(cls, run: RunContext, section, *, states: list[StateGaussians]) -> Registration:
         say = partial(run.log, cls.phase_name)
+        assert run.scene.box is not None  # every scene that is trained on has one
         return align_states(states, evidence_of(run, states), run.views, run.scene.box, section.config, run.rasterizer, say)
 
     @classmethod

@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from p2gs.ops.knn import search_tree
 from p2gs.ops.repel import repel_force
 
 __all__ = ["place_repel_points", "repel_force"]
@@ -35,8 +36,6 @@ def place_repel_points(
     gradient.
     Raises ValueError for another mode.
     """
-    from scipy.spatial import cKDTree
-
     static, movable = static_points.detach(), movable_points.detach()
     if len(static) == 0 or len(movable) == 0 or count <= 0:
         return static.new_zeros((0, 3))
@@ -46,7 +45,7 @@ def place_repel_points(
     reach = {"relative": lambda: threshold * extent, "absolute": lambda: threshold, "spacing": lambda: threshold * _spacing(static)}
     if mode not in reach:
         raise ValueError(f"threshold mode '{mode}' is not one of {', '.join(reach)}")
-    distance, _ = cKDTree(movable.cpu().numpy()).query(static.cpu().numpy())
+    distance, _ = search_tree(movable.cpu().numpy()).query(static.cpu().numpy())
     near = torch.from_numpy(distance < reach[mode]()).nonzero()[:, 0]
     chosen = near[torch.randperm(len(near), generator=generator)[:count]]
     points = static[chosen.to(static.device)]
@@ -57,9 +56,7 @@ def place_repel_points(
 
 
 def _spacing(points: Tensor) -> float:
-    from scipy.spatial import cKDTree
-
     x = points.cpu().numpy()
     if len(x) < 2:
         return 0.0
-    return float(torch.from_numpy(cKDTree(x).query(x, k=2)[0][:, 1]).median())
+    return float(torch.from_numpy(search_tree(x).query(x, k=2)[0][:, 1]).median())

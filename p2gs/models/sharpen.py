@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from p2gs.data.base import Visit
 from p2gs.data.views import TrainingViews
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.context import RunContext
@@ -59,11 +60,11 @@ class SharpenPhase(StatePhase):
         super().__init__(config, losses, state.state, views, **common)
         self.splats = Splats(state.gaussians)
 
-    def inputs(self, step: int) -> LossInputs:
-        camera, target = self.target(step, self.state)
+    def inputs(self, visit: Visit) -> LossInputs:
+        camera, target = self.target(visit)
         g = self.splats.tensors()
         render = self.render(g, camera, target.background)
-        return LossInputs(step, self.total_steps, g, render, target, camera, cache=self.loss_cache)
+        return LossInputs(visit.step, self.total_steps, g, render, target, camera, cache=self.loss_cache)
 
     def hand_over(self) -> StateGaussians:
         return StateGaussians(self.state, self.splats.tensors().clone())

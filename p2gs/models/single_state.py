@@ -9,7 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from p2gs.data.views import TrainingViews, view_index
+from p2gs.data.base import Visit
+from p2gs.data.views import TrainingViews
 from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.context import RunContext
 from p2gs.models.draw import render_gaussians
@@ -102,11 +103,11 @@ class ImagePhase(Phase):
             return torch.rand(3, generator=self.generator(step, 1))
         return torch.full((3,), {"white": 1.0, "black": 0.0, "grey": 0.5}[self.config.background])
 
-    def target(self, step: int, state: int) -> tuple[Camera, Target]:
-        """The photograph of this step: camera and target of one training view of ``state``."""
-        views = self.views[state]
+    def target(self, visit: Visit) -> tuple[Camera, Target]:
+        """The photograph of this step: its camera and what the render is held against."""
+        views, step = self.views[visit.state], visit.step // len(self.views)
         background = self.background(step)
-        picked = views.get(view_index(self.seed + 7919 * state, step, len(views)), views.levels.index(self.level(step)), background)
+        picked = views.get(visit.view, views.levels.index(self.level(step)), background)
         # the same view recurs with other backgrounds: statistics of the target may be cached only where it does not change
         key = picked.key if self.config.background != "random" else None
         device = self.splats.means.device
@@ -188,10 +189,11 @@ class SingleStatePhase(StatePhase):
         self.shots = scene.select(state=state, split="train")
         self.errors, self.without_gains = ViewErrors(len(self.shots)), None
 
-    def inputs(self, step: int) -> LossInputs:
+    def inputs(self, visit: Visit) -> LossInputs:
+        step = visit.step
         self.forgive(step)
-        camera, target = self.target(step, self.state)
-        camera = self.errors.camera(view_index(self.seed + 7919 * self.state, step, len(self.shots)), camera)
+        camera, target = self.target(visit)
+        camera = self.errors.camera(visit.view, camera)
         g = self.splats.tensors()
         degree = min(self.config.sh_degree, step // max(self.config.sh_every, 1))
         render = self.render(g, camera, target.background, degree)

@@ -35,6 +35,23 @@ class Splats(nn.Module):
     resized first.
     """
 
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh0: Tensor
+    sh_rest: Tensor
+    grad_sum: Tensor
+    seen: Tensor
+    # extra and carried ones of fusion and articulation
+    psi: Tensor
+    labels: Tensor
+    margin: Tensor
+    paired: Tensor
+    mu0: Tensor
+    mu1: Tensor
+    offsets: Tensor
+
     def __init__(self, gaussians: GaussianTensors, extra: dict[str, Tensor] | None = None, carried: dict[str, Tensor] | None = None):
         super().__init__()
         n = len(gaussians)

@@ -11,11 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from p2gs.models.discovery.surfels import Surfels
 from p2gs.ops import se3
+from p2gs.ops.knn import search_tree
 
 SAME_SIDE = 0.7  # cosine between normals of one surface, 45 degrees
 ALONG = 3.0  # spacings of the surfels: a point farther along the surface from its nearest surfel has none there
@@ -42,7 +42,7 @@ def fit_surfaces(source: Surfels, target: Surfels, reach: float, rounds: int = 4
     pick = torch.linspace(0, len(source) - 1, min(len(source), most)).round().long()
     points, normals = source.points[pick].double(), source.normals[pick].double()
     onto, facing = target.points.double(), target.normals.double()
-    tree = cKDTree(onto.numpy())
+    tree = search_tree(onto.numpy())
     noise = (source.noise**2 + target.noise**2) ** 0.5
     spacing = max(source.spacing, target.spacing)
     T = torch.eye(4, dtype=torch.float64)
@@ -65,7 +65,7 @@ def fit_surfaces(source: Surfels, target: Surfels, reach: float, rounds: int = 4
     return SurfaceFit(T, float(agree.double().mean()), spread, float(r[agree].square().mean().sqrt()))
 
 
-def _pairs(T: Tensor, points: Tensor, normals: Tensor, tree: cKDTree, onto: Tensor, facing: Tensor, along: float):
+def _pairs(T: Tensor, points: Tensor, normals: Tensor, tree, onto: Tensor, facing: Tensor, along: float):
     """Moved points [N, 3], the surfel nearest to each [N], the distance from its plane [N], and whether both are of one surface [N]."""
     p, n = se3.apply(T, points), normals @ T[:3, :3].T
     j = torch.from_numpy(tree.query(p.numpy())[1])

@@ -7,6 +7,7 @@ colours still have to follow.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -81,7 +82,8 @@ def tune(
         if not values:  # none is due in this step
             return
         optimizer.zero_grad(set_to_none=True)
-        sum(values).backward()
+        total: Any = sum(values)
+        total.backward()
         optimizer.step()
 
     with serial_torch(draws_natively(splats.means, backend)):

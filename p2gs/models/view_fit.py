@@ -9,7 +9,7 @@ half must explain the other half better.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -74,6 +74,12 @@ class ViewErrors(nn.Module):
     twists [V, 6] and log_gains [V, 3], float64; their means are zero.  on [2] bool: gains, cameras; decided: whether that is known.
     """
 
+    twists: Tensor
+    moments: Tensor
+    log_gains: Tensor
+    on: Tensor
+    decided: Tensor
+
     def __init__(self, count: int):
         super().__init__()
         self.register_buffer("twists", torch.zeros(count, 6, dtype=torch.float64))
@@ -94,13 +100,13 @@ class ViewErrors(nn.Module):
 
     def learn(self, rate: float) -> None:
         """One step of the camera that was looked at last, after the backward pass."""
-        if self._looked_at is None or self._looked_at[1].grad is None:
+        index, twist = self._looked_at or (0, None)
+        if twist is None or twist.grad is None:
             return
-        index, twist = self._looked_at
         RowAdam(self.twists, self.moments).step(index, twist.grad, rate)
         self.twists -= self.twists.mean(0)
 
-    def views(self, shots: list[View]) -> list[View]:
+    def views(self, shots: Sequence[View]) -> list[View]:
         """The photographs without their gains, their cameras as they were."""
         still = torch.eye(4, dtype=torch.float64).expand(len(shots), 4, 4)
         return correct_views(shots, ViewCorrections(still, self.log_gains.cpu()))
@@ -177,6 +183,7 @@ def fit_camera(g: GaussianTensors, shot: TargetImage, half: Tensor, config: View
     for step in range(config.steps):
         twist = table[0].clone().requires_grad_()
         half_error(g, shot, half, twist, backend).backward()
+        assert twist.grad is not None
         adam.step(0, twist.grad, 2 * config.rate * 0.1 ** (step / config.steps))
     return table[0]
 

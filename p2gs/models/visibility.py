@@ -52,6 +52,7 @@ def visible_share(g: GaussianTensors, cameras: list[Camera], backend: str = "aut
             g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh,
             camera.viewmat, camera.K, camera.width, camera.height, **options,
         )  # fmt: skip
+        assert out.features is not None
         (seen,) = torch.autograd.grad(out.features.sum(), features)
         best = torch.maximum(best, seen[:, 0] / footprint(g, camera, pixels).clamp_min(1e-6))
     return best.clamp(0, 1).cpu()

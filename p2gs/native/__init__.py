@@ -8,16 +8,19 @@ from __future__ import annotations
 import os
 import warnings
 from contextlib import contextmanager
-from typing import Iterator, Optional
+from typing import Any, Iterator, Optional
 
 from p2gs.types import UserError
 
 why_missing: Optional[str] = None
 
+native: Any = None
+
 try:
-    from p2gs import _native as native
+    from p2gs import _native  # pyright: ignore[reportAttributeAccessIssue]
+
+    native = _native
 except ImportError as err:
-    native = None
     if getattr(err, "name", None) == "p2gs._native" or "cannot import name" in str(err):
         why_missing = "p2gs was installed without its native kernels (no C++ compiler was found)"
     else:

@@ -60,7 +60,7 @@ def carry(means: Tensor, quats: Tensor, sh: Tensor, parts: Parts, transforms: Te
         parts.count,
         num_threads(),
     )
-    return tuple(new)
+    return new[0], new[1], new[2]
 
 
 @torch.no_grad()

@@ -63,3 +63,10 @@ def knn_reference(
     if not found:
         return points.new_empty(0, k), torch.empty(0, k, dtype=torch.int64, device=points.device)
     return torch.cat([d for d, _ in found]), torch.cat([i for _, i in found])
+
+
+def search_tree(points):
+    """scipy's k-d tree of points [N, D], an array: for other questions than ``knn``'s."""
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
+    return cKDTree(points)

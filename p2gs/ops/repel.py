@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from p2gs.native import native, num_threads
+from p2gs.ops.knn import search_tree
 
 Reduce = Literal["sum", "mean", "local", "within"]
 EVERYWHERE = 1e6  # a radius (units of the points) that takes in every repel point; its square fits a float32
@@ -41,15 +42,15 @@ def repel_force(
         raise ValueError(f"repel_force(reduce='{reduce}') needs a positive radius")
     if points.shape[0] == 0 or repel_points.shape[0] == 0:
         return torch.zeros_like(points)
-    near = reduce in ("local", "within")
+    near, within = reduce in ("local", "within"), float(radius or 0.0)
     if _native_applies(points, repel_points):
-        reach, mean = float(radius) if near else EVERYWHERE, reduce in ("mean", "local")
+        reach, mean = within if near else EVERYWHERE, reduce in ("mean", "local")
         force = _Native.apply(points, repel_points, float(exponent), float(eps), reach, mean)
     elif near and points.device.type == "cpu":
-        force = _sparse(points, repel_points, exponent, eps, radius, reduce)
+        force = _sparse(points, repel_points, exponent, eps, within, reduce)
     else:
         rows = max(1, chunk // repel_points.shape[0])
-        force = torch.cat([_dense(p, repel_points, exponent, eps, reduce, radius) for p in points.split(rows)])
+        force = torch.cat([_dense(p, repel_points, exponent, eps, reduce, within) for p in points.split(rows)])
     force = k_r * force
     if tau_max is None:
         return force
@@ -64,7 +65,7 @@ def _pull(offset: Tensor, exponent: float, eps: float) -> tuple[Tensor, Tensor]:
     return offset * sq.clamp_min(eps * eps).pow(-0.5 * exponent), sq
 
 
-def _dense(points: Tensor, repel_points: Tensor, exponent: float, eps: float, reduce: Reduce, radius: float | None) -> Tensor:
+def _dense(points: Tensor, repel_points: Tensor, exponent: float, eps: float, reduce: Reduce, radius: float) -> Tensor:
     pull, sq = _pull(repel_points[None] - points[:, None], exponent, eps)
     if reduce in ("sum", "mean"):
         return pull.sum(1) if reduce == "sum" else pull.mean(1)
@@ -102,9 +103,7 @@ class _Native(torch.autograd.Function):
 
 
 def _sparse(points: Tensor, repel_points: Tensor, exponent: float, eps: float, radius: float, reduce: Reduce) -> Tensor:
-    from scipy.spatial import cKDTree
-
-    tree, repel_tree = (cKDTree(x.detach().numpy()) for x in (points, repel_points))
+    tree, repel_tree = (search_tree(x.detach().numpy()) for x in (points, repel_points))
     pairs = tree.sparse_distance_matrix(repel_tree, radius, output_type="ndarray")
     i, j = (torch.from_numpy(pairs[n].astype("int64")) for n in ("i", "j"))
     pull, _ = _pull(repel_points[j] - points[i], exponent, eps)

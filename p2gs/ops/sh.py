@@ -64,7 +64,7 @@ def basis(degree: int, directions: Tensor) -> Tensor:
             -c1 * y * ring,
             c0 * z * (2 * zz - 3 * xx - 3 * yy),
             -c1 * x * ring,
-            0.5 * c2 * z * (xx - yy),
+            0.5 * c2 * z * (xx - yy),  # pyright: ignore[reportOperatorIssue]
             -c3 * x * (xx - 3 * yy),
         ]
     return torch.stack(out, -1)

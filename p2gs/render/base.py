@@ -99,9 +99,9 @@ def check(a: RenderInputs, sh_degree: Optional[int], median_depth: Optional[bool
         _expect("sh_rest", a.sh_rest, n, None, 3)
         bases += a.sh_rest.shape[1]
     available = degree_of(bases)
-    a.sh_degree = available if sh_degree is None else int(sh_degree)
-    if not 0 <= a.sh_degree <= available:
-        raise ValueError(f"rasterize: sh_degree {sh_degree} needs {(int(sh_degree) + 1) ** 2} coefficients, sh has {bases}")
+    wanted = a.sh_degree = available if sh_degree is None else int(sh_degree)
+    if not 0 <= wanted <= available:
+        raise ValueError(f"rasterize: sh_degree {wanted} needs {(wanted + 1) ** 2} coefficients, sh has {bases}")
     if a.features is not None:
         _expect("features", a.features, n, None)
         if not 1 <= a.features.shape[1] <= MAX_FEATURES:

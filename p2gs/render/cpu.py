@@ -69,7 +69,7 @@ class _Rasterize(torch.autograd.Function):
             v_features = torch.empty_like(features) if features_out is not None else torch.zeros_like(features)
         native_features = v_features if features_out is not None else None
         if features_out is not None and v_features is None:
-            native_features = torch.empty_like(features)
+            native_features = torch.empty_like(features)  # pyright: ignore[reportArgumentType]
         v_rest = None if sh_rest is None else torch.empty_like(sh_rest)
         v_view = torch.zeros(4, 4) if ctx.needs_input_grad[2] else None  # its last row is (0, 0, 0, 1) and stays
         ctx.view.backward([_address(t) for t in (*incoming, *gradients, native_features, ctx.abs_grad, v_rest, v_view)], num_threads())

@@ -54,7 +54,7 @@ def through_gsplat(a: RenderInputs) -> RenderOutput:
     z = (means @ R[2] + t[2])[:, None]
     values = torch.cat([colour, z, *([(z - a.depth_ref) ** 2] if a.depth_sq else []), *features], 1)
 
-    image, alpha, meta = rasterization(
+    image, alpha, meta = rasterization(  # pyright: ignore[reportCallIssue]
         means=means,
         quats=quats,
         scales=scales,

@@ -41,7 +41,7 @@ def train(run: RunContext, cls: type[Stage], stage: str, section: Any, key: str,
         **arguments,
     )
     with at_step_ends():
-        trainer.fit(phase, ckpt_path=resumable(run.run_dir, stage, key), weights_only=True)
+        trainer.fit(phase, datamodule=run.cfg.data, ckpt_path=resumable(run.run_dir, stage, key), weights_only=True)
     if trainer.global_step < phase.total_steps:
         raise KeyboardInterrupt
     return phase.cpu().hand_over()

@@ -18,7 +18,10 @@ MISTAKES = [
     (["--callbacks.progres", "{}"], r"did you mean 'callbacks\.progress'"),
     (["--phases.first.steps", "many"], r"phases\.first\.steps: expected a whole number, got 'many'"),
     (["--phases.first.init", "hull"], r"phases\.first\.init: expected one of auto, random, got 'hull'"),
-    (["--phases.first.rates", "null", "--phases.first.rates", "3"], r"phases\.first\.rates: expected options \(key: value\), got '3'"),
+    (
+        ["--phases.first.rates", "null", "--phases.first.rates", "3"],
+        r"phases\.first\.rates: expected options \(key: value\) or null, got '3'",
+    ),
     (["--phases.second.losses.part", "true"], r"phases\.second\.losses\.part: expected options \(key: value\) or null, got 'true'"),
     (["--phases.second.losses.part.variant", "letter"], r"expected one of paper, sane"),
     (["--device", "gpu"], r"device: expected one of auto, cpu, cuda, got 'gpu'"),

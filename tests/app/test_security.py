@@ -90,6 +90,18 @@ def test_a_config_that_would_run_something_is_refused(tmp_path):
     assert not proof.exists()
 
 
+def test_an_option_that_holds_anything_makes_no_object(tmp_path):
+    from p2gs.bench.plan import BenchOptions
+    from p2gs.schema import Given
+
+    proof = tmp_path / "ran"
+    told = {"class_path": "subprocess.Popen", "init_args": {"args": ["touch", str(proof)]}}
+    options = Given(BenchOptions, {"set": {"phases.x": told}, "slurm": {"extra": told}}).make()
+    assert options.set == {"phases.x": told} and options.slurm.extra == told
+    (tmp_path / "t.yaml").write_text(json.dumps({"trainer": {"logger": told}}))
+    assert load_config([str(tmp_path / "t.yaml")]).trainer == {"logger": told} and not proof.exists()
+
+
 @pytest.mark.parametrize("how", ["flipped", "cut", "emptied", "unsealed"])
 def test_the_checksum_tells(tmp_path, how):
     path, n = tmp_path / "a.pt", 20

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from p2gs.config import load_config
-from p2gs.schema import section_of
+from p2gs.schema import keys_of
 from p2gs.types import UserError
 
 FOLDER = Path(__file__).parents[2] / "configs" / "ablation"
@@ -115,7 +115,7 @@ def test_the_dynamic_repel_points_follow_the_length_of_the_phase():
         def place_repel_points(self, step):
             self.placed.append(step)
 
-    assert section_of(RepelRefresh).children.keys() >= {"every", "fraction"}
+    assert keys_of(RepelRefresh).keys() >= {"every", "fraction"}
     phase, callback = Phase(), RepelRefresh(fraction=0.25)
     for phase.step in range(1, 41):
         callback.on_step(None, phase)

@@ -7,10 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lightning.pytorch import LightningModule, Trainer
 
-from p2gs.data.base import ViewLoader
+from p2gs.data.base import TwoStateData, Visit
 from p2gs.data.box import farthest_cameras, mask_bounds
 from p2gs.data.images import downscale_rgba, resize_nearest
-from p2gs.data.modules import DATASETS
 from p2gs.data.views import TrainingViews, crop_window, view_index
 from p2gs.types import Camera, View
 
@@ -35,43 +34,59 @@ class Recorder(LightningModule):
     def __init__(self):
         super().__init__()
         self.weight = torch.nn.Parameter(torch.zeros(1))
-        self.seen = []
+        self.seen, self.views, self.seed = [], {0: range(7), 1: range(5)}, 4
+
+    @property
+    def step(self):
+        return self.global_step
 
     def training_step(self, batch, _):
-        self.seen.append(tuple(int(x) for x in batch))
+        self.seen.append(batch)
         return self.weight.sum()
 
     def configure_optimizers(self):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
+class Nothing(TwoStateData):
+    """A data module without a scene."""
+
+    def __init__(self):
+        super().__init__("")
+
+    def setup(self, stage=None):
+        pass
+
+
 def quiet_trainer(steps, folder):
     options = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
-    return Trainer(max_steps=steps, accelerator="cpu", default_root_dir=folder, **options)
+    return Trainer(max_steps=steps, max_epochs=-1, accelerator="cpu", default_root_dir=folder, **options)
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("stop", [3, 7, 10])
 def test_resumed_trainer_sees_what_an_unbroken_one_would(tmp_path, stop):
-    """Epochs of 7 views; broken off in the middle, at the end, and past the end of one."""
-    whole = Recorder()
-    quiet_trainer(17, tmp_path).fit(whole, ViewLoader(7, seed=4))
+    """Seven views of one state, five of the other."""
+    whole, data = Recorder(), Nothing()
+    quiet_trainer(17, tmp_path).fit(whole, datamodule=data)
     first = Recorder()
     trainer = quiet_trainer(stop, tmp_path)
-    trainer.fit(first, ViewLoader(7, seed=4))
+    trainer.fit(first, datamodule=data)
     trainer.save_checkpoint(tmp_path / "stop.ckpt")
     second = Recorder()
-    quiet_trainer(17, tmp_path).fit(second, ViewLoader(7, seed=4), ckpt_path=tmp_path / "stop.ckpt", weights_only=True)
+    quiet_trainer(17, tmp_path).fit(second, datamodule=data, ckpt_path=tmp_path / "stop.ckpt", weights_only=True)
     assert first.seen + second.seen == whole.seen
-    assert whole.seen == [(s, view_index(4, s, 7)) for s in range(17)]
+    assert whole.seen == [Visit(s, s % 2, view_index(4 + 7919 * (s % 2), s // 2, (7, 5)[s % 2])) for s in range(17)]
 
 
-def test_data_module_loader_covers_the_training_views(written):
-    data = DATASETS["artgs"](root=str(written["artgs"]), seed=3)
-    loader = data.train_dataloader()
-    assert len(loader) == 16
-    stream = iter(loader)
-    assert sorted(view for _, (_, view) in zip(range(16), stream, strict=False)) == list(range(16))
+def test_a_loader_covers_the_views_of_its_states():
+    both = {0: range(8), 1: range(8)}
+    loader = Nothing().visits(both, 3)
+    seen = [loader[step] for step in range(16)]
+    assert sorted(visit[1:] for visit in seen) == [(state, view) for state in (0, 1) for view in range(8)]
+    assert list(zip(range(3), Nothing().visits(both, 3, first=5), strict=False)) == [(i, loader[5 + i]) for i in range(3)]
+    assert [v.view for v, _ in zip(Nothing().visits({1: range(8)}, 3), range(8), strict=False)] == [v.view for v in seen if v.state == 1]
+    assert Nothing().visits({}, 3)[9] == Visit(9)  # of a phase that looks at none
 
 
 def random_view(rng, height, width, depth=True):

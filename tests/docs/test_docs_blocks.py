@@ -92,7 +92,7 @@ def test_python_of_the_cpu_page_runs(capsys):
 
 def test_the_callback_writes_its_file_in_a_training_phase(desk):
     from lightning.pytorch import Trainer
-    from tiny import hinge, tiny_scene
+    from tiny import TinyData, hinge, tiny_scene
 
     from p2gs.data.views import TrainingViews
     from p2gs.losses.base import LOSSES
@@ -107,8 +107,9 @@ def test_the_callback_writes_its_file_in_a_training_phase(desk):
     config = SingleStateConfig(steps=5, initial_gaussians=50, levels=[24], level_starts=[0.0])
     views = TrainingViews(scene.select(state=0), [24])
     phase = SingleStatePhase(config, {"render": LOSSES["render"]()}, scene, 0, views)
-    Trainer(max_steps=5, max_epochs=-1, accelerator="cpu", logger=False, callbacks=[callback], default_root_dir=desk,
-            enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False).fit(phase)  # fmt: skip
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
+    trainer = Trainer(max_steps=5, max_epochs=-1, accelerator="cpu", callbacks=[callback], default_root_dir=desk, **quiet)
+    trainer.fit(phase, datamodule=TinyData())
     lines = [json.loads(line) for line in (desk / "joints.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [2, 4, 5] and lines[0]["gaussians"] == 50
 

@@ -167,7 +167,7 @@ def test_an_edit_of_ones_own_phase_makes_it_again_and_nothing_before_it(desk, ru
     file = desk / "my_phases.py"
     text = file.read_text()
     try:
-        file.write_text(text.replace("state, g = step % 2,", "state, g = (step + 1) % 2,"))
+        file.write_text(text.replace("self.moves[visit.state]", "self.moves[1 - visit.state]"))
         words = ["-c", str(run / "config.yaml"), "--threads", "1", "--run", str(run), "--only", "articulation"]
         done = p2gs(desk, "fit", *words)
     finally:

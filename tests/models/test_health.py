@@ -3,7 +3,7 @@
 import pytest
 import torch
 from lightning.pytorch import Trainer
-from tiny import hinge, random_gaussians, tiny_scene
+from tiny import TinyData, hinge, random_gaussians, tiny_scene
 
 from p2gs.callbacks.base import Callback
 from p2gs.callbacks.checkpoint import Checkpoint
@@ -30,7 +30,7 @@ def fit(phase, folder, *callbacks, until=None):
     steps = until or phase.total_steps
     options = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
     trainer = Trainer(max_steps=steps, max_epochs=-1, accelerator="cpu", callbacks=list(callbacks), default_root_dir=folder, **options)
-    trainer.fit(phase)
+    trainer.fit(phase, datamodule=TinyData())
     return phase
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from lightning.pytorch import Trainer
-from tiny import hinge, textured_panels, tiny_scene
+from tiny import TinyData, hinge, textured_panels, tiny_scene, visit
 
 import p2gs.losses  # noqa: F401  (registers the built-in losses)
 from p2gs.callbacks.checkpoint import Checkpoint
@@ -71,13 +71,14 @@ def fit(phase, folder, until=None, resume=None, densify=True):
     steps = phase.total_steps if until is None else until
     trainer = Trainer(max_steps=steps, max_epochs=-1, accelerator="cpu", logger=False, callbacks=callbacks, default_root_dir=folder,
                       enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False)  # fmt: skip
-    trainer.fit(phase, ckpt_path=resume, weights_only=True)
+    trainer.fit(phase, datamodule=TinyData(), ckpt_path=resume, weights_only=True)
     return phase
 
 
 def test_only_what_losses_ask_for_is_made(scene, views):
     def made(*chosen):
-        return build("articulation", scene, views, chosen).inputs(0)
+        phase = build("articulation", scene, views, chosen)
+        return phase.inputs(visit(phase))
 
     plain = made("render", "flat")
     assert plain.parts is None and plain.render.depth_sq is None
@@ -86,7 +87,7 @@ def test_only_what_losses_ask_for_is_made(scene, views):
     assert made("render", "art").parts.target_rotation is not None
     seldom = build("articulation", scene, views, ("render", "part"))
     seldom.losses["part"].start = 0.5
-    assert seldom.inputs(0).parts is None
+    assert seldom.inputs(visit(seldom)).parts is None
 
 
 @pytest.mark.parametrize("name", ["single_state", "articulation"])
@@ -117,7 +118,7 @@ def test_resume_is_bit_exact_across_densification(name, scene, views, tmp_path):
 def test_single_state_learns_the_image(scene, views, tmp_path):
     phase = build("single_state", scene, views)
     phase.config.steps = 150
-    before = float(phase.total_loss(phase.inputs(0)).detach())
+    before = float(phase.total_loss(phase.inputs(visit(phase))).detach())
     fit(phase, tmp_path)
     assert float(phase.scalars["loss/total"]) < 0.6 * before
 
@@ -170,7 +171,7 @@ def test_no_loss_at_all_is_told(scene, views):
     phase = build("single_state", scene, views)
     phase.losses = {}
     with pytest.raises(UserError, match="no loss applies"):
-        phase.total_loss(phase.inputs(0))
+        phase.total_loss(phase.inputs(visit(phase)))
 
 
 @pytest.mark.parametrize("init", ["identity", "random"])

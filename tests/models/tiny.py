@@ -2,10 +2,26 @@
 
 import torch
 
+from p2gs.data.base import TwoStateData, Visit
 from p2gs.models.screw_polish import MovedGaussians
 from p2gs.ops import se3
 from p2gs.render import rasterize
 from p2gs.types import Camera, GaussianTensors, TwoStateScene, View
+
+
+class TinyData(TwoStateData):
+    """A phase's views are its own; this says which of them a step looks at."""
+
+    def __init__(self):
+        super().__init__("")
+
+    def setup(self, stage=None):
+        pass
+
+
+def visit(phase, step: int = 0) -> Visit:
+    """What the phase looks at in a step."""
+    return TinyData().visits(phase.views, phase.seed)[step]
 
 
 def random_gaussians(n: int, seed: int = 0, degree: int = 1) -> GaussianTensors:

@@ -16,6 +16,7 @@ from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
 from p2gs.data.capture.hypotheses import State, Votes
 from p2gs.data.capture.model import Model, similarity
+from p2gs.ops.knn import search_tree
 
 GUIDED = 0.004  # reprojection error over the long edge for points found with the hypothesis known: half of what a vote may have
 NEAR = 0.03  # two reconstructions of one point differ by less than this share of the cameras' distance
@@ -44,10 +45,8 @@ def is_end(name: str) -> bool:
 
 def guided_pairs(start: State, end: State, T: np.ndarray) -> np.ndarray:
     """[n, 2] rows of points that are one under the similarity T [4, 4] start -> end."""
-    from scipy.spatial import cKDTree
-
     _, distance = end.model.centre()
-    tree = cKDTree(end.model.xyz)
+    tree = search_tree(end.model.xyz)
     moved = start.model.xyz @ T[:3, :3].T + T[:3, 3]
     reach, near = tree.query(moved, k=8, distance_upper_bound=NEAR * distance)
     rows, column = np.nonzero(np.isfinite(reach))
