@@ -23,6 +23,11 @@ setup-dev: .venv/.dev .venv/.built
 	$(BIN)/pip install -q -c constraints.txt -e ".[dev]"
 	touch $@
 
+# What p2gs export --check runs, but for node's.
+.venv/.validate: .venv/.deps
+	$(BIN)/pip install -q -c constraints.txt -e ".[validate]"
+	touch $@
+
 # Kernels that are newer than the last installation.
 .venv/.built: .venv/.deps CMakeLists.txt $(NATIVE)
 	test -z "$$(find CMakeLists.txt $(NATIVE) -newer .venv/.deps)" || $(BIN)/pip install -q --no-deps -e .

@@ -106,8 +106,10 @@ def _warn(text: str) -> None:
 
 
 def _metres_per_unit(args: argparse.Namespace, run: Path) -> float:
-    """Of --scale or --height; warns where the object comes out in a size that nothing has."""
-    from p2gs.export.asset import start_box, unlikely_size
+    """Of --scale or --height; warns where the object comes out in a size that its kind has not."""
+    from p2gs.export.asset import start_box
+    from p2gs.export.metadata import read_meta
+    from p2gs.export.sizes import unlikely_size
 
     if not args.scale > 0:
         raise UserError(f"--scale: expected a positive number of metres per unit, got {args.scale:g}")
@@ -117,7 +119,8 @@ def _metres_per_unit(args: argparse.Namespace, run: Path) -> float:
         if not args.height > 0:
             raise UserError(f"--height: expected a positive number of metres, got {args.height:g}")
         scale = args.height / float(sides[2])
-    unlikely = unlikely_size(scale * float(sides.max()))
+    category = "" if args.meta is None else str(read_meta(args.meta).get("category", ""))
+    unlikely = unlikely_size(scale * float(sides.max()), f"{category} {run.resolve().name}")
     if unlikely is not None:
         _warn(unlikely)
     return scale

@@ -34,7 +34,6 @@ DENSITIES = {  # kg / m^3 of the collision pieces, which fill a shell's hollow w
     "glass": 2500.0,
     "ceramic": 2300.0,
 }
-LIKELY_SIZE = (0.05, 3.0)  # m, longest side: a stapler to a wardrobe
 MAX_FACES = 40_000  # a part's visual mesh; simulators refuse meshes of several hundred thousand
 SETTLE = 0.5  # seconds in which an undriven joint loses most of its speed; sets the default damping
 UPS = ("z", "y", "x")
@@ -138,13 +137,6 @@ def start_box(run_dir: Path | str) -> np.ndarray:
         meshes = read_meshes(run_dir)
     points = np.concatenate([m.vertices for m in meshes])
     return np.array([points.min(0), points.max(0)])
-
-
-def unlikely_size(longest: float) -> Optional[str]:
-    """A sentence where the longest side [m] is none that household objects have."""
-    if LIKELY_SIZE[0] <= longest <= LIKELY_SIZE[1]:
-        return None
-    return f"the object's longest side comes out as {longest:.3g} m: give metres per unit of the input with --scale, or its --height"
 
 
 def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placement:

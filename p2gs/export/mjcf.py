@@ -19,7 +19,9 @@ def write_mjcf(asset: Asset, out: Path) -> Path:
     write_assets(asset, out)
     root = ET.Element("mujoco", model=asset.name)
     ET.SubElement(root, "compiler", angle="radian", meshdir=FOLDER, texturedir=FOLDER, autolimits="true")
-    ET.SubElement(root, "option", timestep="0.002", integrator="implicitfast", gravity=numbers(GRAVITY[asset.up]))
+    option = ET.SubElement(root, "option", timestep="0.002", integrator="implicitfast", gravity=numbers(GRAVITY[asset.up]))
+    if asset.fixed is False:  # where the base moves, MuJoCo lets parts pass through it unless told
+        ET.SubElement(option, "flag", filterparent="disable")
     _defaults(root)
     meshes = ET.SubElement(root, "asset")
     world = ET.SubElement(root, "worldbody")

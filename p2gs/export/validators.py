@@ -47,14 +47,19 @@ def _engine(name: str) -> Callable[[Path], Judged]:
     return run
 
 
+LONGEST = 1800.0  # s that an engine of simcheck's may take; its own 240 are too few for a twin on a busy machine
+
+
 def _simcheck(name: str) -> Callable[[Path], Judged]:
     def run(folder: Path) -> Judged:
         import simcheck
 
-        report = simcheck.check(str(folder / name))
+        report = simcheck.check(str(folder / name), thresholds={"engine_timeout": LONGEST})
         done = sum(r.status == "pass" for r in report.results)
-        warned = "; ".join(f"warning, {f.check}: {f.message}" for f in report.warnings)
-        return Judged(tuple(f"{f.check}: {f.message}" for f in report.errors), f"{done} checks pass{'; ' * bool(warned)}{warned}")
+        late = [f for f in report.warnings if f.data.get("incomplete")]  # to simcheck a warning; but then its checks were not made
+        warned = "; ".join(f"warning, {f.check}: {f.message}" for f in report.warnings if f not in late)
+        problems = tuple(f"{f.check}: {f.message}" for f in [*report.errors, *late])
+        return Judged(problems, f"{done} checks pass{'; ' * bool(warned)}{warned}")
 
     return run
 

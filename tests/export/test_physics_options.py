@@ -6,9 +6,10 @@ import trimesh
 from toy import toy_scene, toy_twin
 
 from p2gs.app import run as p2gs
-from p2gs.export.asset import DENSITIES, load_asset, start_box, unlikely_size
+from p2gs.export.asset import DENSITIES, load_asset, start_box
 from p2gs.export.mesh import write_meshes
 from p2gs.export.run_folder import write_twin
+from p2gs.export.sizes import unlikely_size
 from p2gs.types import Similarity
 
 
@@ -53,6 +54,14 @@ def test_a_size_that_nothing_has_is_warned_of(run, tmp_path, capsys):
     assert p2gs(["export", str(run), "--format", "ply", "--scale", "10", "--out", str(tmp_path)]) == 0
     assert "longest side comes out as" in capsys.readouterr().err
     assert unlikely_size(0.8) is None and unlikely_size(0.001) is not None
+
+
+def test_a_laptop_as_large_as_a_table_is_warned_of(run, tmp_path, capsys):
+    assert unlikely_size(1.4) is None and "a laptop: 0.2 to 0.7" in unlikely_size(1.4, "Laptop laptop_10211")
+    meta = tmp_path / "meta.yaml"
+    meta.write_text("category: Laptop\n")
+    words = ["export", str(run), "--profile", "sapien", "--meta", str(meta), "--out", str(tmp_path / "out")]
+    assert p2gs([*words, "--height", "1.4"]) == 0 and "(a laptop: 0.2 to 0.7)" in capsys.readouterr().err
 
 
 def test_mass_goes_by_the_material(run):

@@ -190,6 +190,8 @@ def test_the_base_stands_fast_or_floats(fixed, tmp_path):
     for _ in range(50):
         mujoco.mj_step(model, data)
     assert (data.body("base").xpos[2] < -0.01) == (fixed is False)  # in free fall after 0.1 s: 5 cm
+    filtered = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT  # as it does not where the parent stands fast
+    assert filtered == (fixed is not False)
     assert ("PhysicsFixedJoint" in write_usd(asset, tmp_path).read_text()) == (fixed is not False)
 
 

@@ -40,6 +40,13 @@ def test_simcheck_passes_a_twin_and_finds_a_mesh_that_is_gone(tmp_path):
     assert any("part_1_collision_0" in p for p in validator.run(tmp_path).problems)
 
 
+def test_a_simcheck_that_does_not_finish_is_no_pass(tmp_path, monkeypatch):
+    validator = installed("simcheck")
+    write(clear_links(cabinet()).links, tmp_path)
+    monkeypatch.setattr(validators, "LONGEST", 0.001)
+    assert any("did not finish" in p for p in validator.run(tmp_path).problems)
+
+
 @pytest.mark.parametrize("name", ["gltf-validator", "gltf-validator, splats"])
 def test_gltf_passes_but_for_the_extension_that_the_validator_does_not_know(name, tmp_path):
     validator = installed(name)
