@@ -14,7 +14,8 @@ from p2gs.ops.knn import knn
 
 
 def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None) -> PartMotions:
-    """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the energy does not rise.
+    """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the energy does not rise;
+    drop a part, too, that saves less of the image loss than a further one must (``judge.further``).
 
     log: told of each part that goes: what was done, its type, image loss with and without it, what the energy gains.
     """
@@ -26,7 +27,7 @@ def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[d
                 continue
             tried.add(change)
             value, lower = judge(reduced)
-            if value <= lowest:
+            if value <= lowest or (change[0] == "drop" and cost > lower * (1 - judge.further)):
                 break
         else:
             return motions
