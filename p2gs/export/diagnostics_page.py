@@ -143,11 +143,10 @@ def _discovery(d: dict) -> list[str]:
         out.append(
             table(["explanation", "image loss", "energy", "", "parts; what was dropped or merged (image loss with it, without it)"], rows)
         )
-        tried = [t for t in found.get("reconsidered", []) if "glance" in t]
+        tried = [t for t in found.get("reconsidered", []) if "energy" in t and "after" in t]
         if tried:
-            refined = [[f"{t['after']:.4f}", f"{t['energy']:+.4f}"] if "after" in t else ["", ""] for t in tried]
-            rows = [[t["change"], t["type"], f"{t['cost']:.4f}", f"{t['glance']:+.4f}", *r] for t, r in zip(tried, refined, strict=True)]
-            out.append(table(["tried on the chosen one", "type", "image loss", "energy at a glance", "image loss with it", "energy"], rows))
+            rows = [[t["change"], t["type"], f"{t['cost']:.4f}", f"{t['after']:.4f}", f"{t['energy']:+.4f}"] for t in tried]
+            out.append(table(["tried on the chosen one", "type", "image loss", "with it", "energy"], rows))
         rows = [[f"{p['part']}", p["type"], _amount(p), f"{p['confidence']:.2f}"] for p in found["parts"]]
         out.append(table(["part of discovery", "type", "start to end", "share explained"], rows))
     rows = [

@@ -40,7 +40,7 @@ class PartMotionsConfig:
     islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
     (0 = off).  rounds: how often labels, types and motions are settled anew.
     reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched again amid the others,
-    refined where a glance finds them better, and taken where the energy falls.
+    refined, and taken where the energy falls.
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
     """
 

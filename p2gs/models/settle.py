@@ -36,13 +36,12 @@ def reconsider(judge: Judge, motions: PartMotions, limit: int, config: PartMotio
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such as take each for the
     other at the end (``places_changed``), and for each part the two amounts about one axis that explain most (``in_two``). Under each proposal
     every surfel chooses its part anew, and with the ``candidates`` of each kind that surfaces like best the states are re-rendered. The best
-    of each kind is looked at (``look_steps``), and what looks better than the motions as they are is refined: the energy must fall; with a
-    further part the image loss must as well (``judge.further``): what surfaces alone gain is junk.
+    of each kind is refined, and the energy must fall; with a further part the image loss must as well (``judge.further``): what surfaces
+    alone gain is junk.
     Returns the motions and what was tried.
     """
     found, states, log = judge.found, judge.states, []
     lowest, cost = judge(motions)
-    quick = judge.at_a_glance(config.look_steps)
     for _ in range(limit if len(motions) else 0):
         tries = {"exchanged": [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]}
         tries["crossed"] = _proposed(found, states, motions, places_changed(found, motions.transforms, motions.types))
@@ -55,12 +54,9 @@ def reconsider(judge: Judge, motions: PartMotions, limit: int, config: PartMotio
                 continue
             proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[: config.candidates]
             part, tried = min(proposed, key=lambda p: judge(p[1])[0])
-            glance, _, tried = quick.improved(tried)
-            log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "glance": glance - quick(motions)[0]})
-            if glance >= quick(motions)[0]:
-                continue
             value, reached, refined = judge.improved(tried)
-            log[-1] |= {"after": reached, "energy": value - lowest}
+            log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
+            log[-1] |= {"proposed": judge(tried)[0] - lowest, "energy": value - lowest}
             junk = len(refined) > len(motions) and reached > cost * (1 - judge.further)
             if value < (lowest if best is None else best[0]) and not junk:
                 best = (value, reached, refined)

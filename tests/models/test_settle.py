@@ -48,12 +48,12 @@ def test_a_wrong_motion_is_exchanged_for_a_proposed_one_that_is_refined(scene):
     _, found, log = scene("revolute", wrong, [(hinge(), "revolute"), (near, "prismatic")])
     assert found.types == ["prismatic"] and log[0]["type"] == "prismatic" and log[0]["change"] == "exchanged"
     assert float((found.transforms[0] - slide()).norm()) < 0.01  # refined, from 0.035
-    assert log[0]["after"] < log[0]["cost"] and log[0]["energy"] < 0 and log[0]["glance"] < 0 and found.confidence.tolist() == [0.5]
+    assert log[0]["after"] < log[0]["cost"] and log[0]["energy"] < log[0]["proposed"] < 0 and found.confidence.tolist() == [0.5]
 
 
 def test_a_right_motion_stays(scene):
     motions, found, log = scene("prismatic", slide(), [(hinge(), "revolute")])
-    assert found is motions and len(log) == 1 and log[0]["glance"] > 0
+    assert found is motions and len(log) == 1 and log[0]["energy"] > 0
     motions, found, log = scene("prismatic", slide(), [])
     assert found is motions and log == []
 
