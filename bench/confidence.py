@@ -1,4 +1,4 @@
-"""What the measures of a joint (``models/joint_confidence.py``) say of the chance that it is right: data, and the map fitted to them.
+"""What the measures of a joint (``motion/joint_confidence.py``) say of the chance that it is right: data, and the map fitted to them.
 
     python bench/confidence.py RUN... [--zoo DIR] --out FILE     # a line of JSON per joint, right ones and wrong ones
     python bench/confidence.py --fit FILE                        # the numbers that ship, and how they do on scenes left out
@@ -19,19 +19,19 @@ import torch
 from ladder import Case, runs_parser, to_training
 from scipy.optimize import minimize
 
-from p2gs.models import handover
-from p2gs.models.discovery import instead_of, relabel
-from p2gs.models.discovery.hypotheses import directions, sweep
-from p2gs.models.discovery.labels import Graph
-from p2gs.models.discovery.problem import build_problem
-from p2gs.models.discovery.search import Search
-from p2gs.models.evidence import gather_evidence
+from p2gs.gaussians import handover
+from p2gs.gaussians.handover import PartMotions
 from p2gs.models.finish import FinishRecord, measure
-from p2gs.models.handover import PartMotions
-from p2gs.models.joint_confidence import JointEvidence, common_level, features, nudges, state_depth
-from p2gs.models.refine_motions import refine, single_ways
-from p2gs.models.settle import label_gaussians
+from p2gs.motion.discovery import instead_of, relabel
+from p2gs.motion.discovery.hypotheses import directions, sweep
+from p2gs.motion.discovery.labels import Graph
+from p2gs.motion.discovery.problem import build_problem
+from p2gs.motion.discovery.search import Search
+from p2gs.motion.joint_confidence import JointEvidence, common_level, features, nudges, state_depth
+from p2gs.motion.refine_motions import refine, single_ways
 from p2gs.ops import se3
+from p2gs.parts.settle import label_gaussians
+from p2gs.visibility.evidence import gather_evidence
 
 
 def searched(case: Case) -> SimpleNamespace:

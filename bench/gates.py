@@ -15,14 +15,14 @@ from types import SimpleNamespace
 import torch
 from ladder import Case, runs_parser, to_training
 
-from p2gs.models.discovery import discover, relabel
-from p2gs.models.discovery.labels import Graph
-from p2gs.models.discovery.problem import build_problem
-from p2gs.models.evidence import gather_evidence
-from p2gs.models.handover import PartMotions
-from p2gs.models.refine_motions import Judge
-from p2gs.models.settle import label_gaussians
+from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.discovery import discover, relabel
+from p2gs.motion.discovery.labels import Graph
+from p2gs.motion.discovery.problem import build_problem
+from p2gs.motion.refine_motions import Judge
 from p2gs.ops import se3
+from p2gs.parts.settle import label_gaussians
+from p2gs.visibility.evidence import gather_evidence
 
 
 def true_motions(case: Case) -> tuple[torch.Tensor, list[str]]:

@@ -21,14 +21,14 @@ import torch
 import yaml
 from scipy.optimize import linear_sum_assignment
 
-from p2gs.config import load_config
+from p2gs.config.run import load_config
 from p2gs.data.ground_truth import load_ground_truth
+from p2gs.gaussians import handover
 from p2gs.metrics.joints import joint_errors, match_joints
 from p2gs.metrics.modules import JointError
-from p2gs.models import handover
-from p2gs.models.part_motions import find_part_motions
+from p2gs.models.part_discovery import find_part_motions
 from p2gs.ops import se3
-from p2gs.pipeline import Pipeline
+from p2gs.runtime.pipeline import Pipeline
 
 RIGHT = {"axis_angle": 1.0, "axis_position": 0.15, "turn": 1.0, "slide": 0.01}  # the field's bounds of a right joint
 

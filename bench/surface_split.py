@@ -25,10 +25,10 @@ import numpy as np
 import torch
 
 from p2gs.data.ground_truth import GroundTruth
-from p2gs.export.evaluate import open_scene
 from p2gs.metrics.chamfer import POINTS, read_part_meshes, sample_surface, triangles
 from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh, largest_components
+from p2gs.scores.evaluate import open_scene
 from p2gs.types import Camera
 
 NEAR = 0.02  # of the object's size (half the longest side of a unit-sphere object is .5 to 1): three voxels of a mesh, five pixels
@@ -145,7 +145,7 @@ def split(truth: Truth, made: list[list[Mesh]]) -> dict:
 
 def of_run(run: Path, truth: Truth) -> list[list[Mesh]]:
     """The run's meshes in the order of the true parts, an empty one where a part was not found."""
-    from p2gs.export.mesh import read_meshes
+    from p2gs.surface.mesh import read_meshes
 
     assignment = {j["gt"]: j["pred"] for j in json.loads((run / "metrics.json").read_text())["joints"]["joints"] if j["errors"] is not None}
     out = []

@@ -21,9 +21,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Iterable, Iterator, Literal, Optional, Union
 
-from p2gs.config_files import Layer, overrides_layer, parse_overrides, read_config
+from p2gs.config.files import Layer, overrides_layer, parse_overrides, read_config
+from p2gs.config.schema import Given, Keys, Plain, check_keys, keys_of, merge
 from p2gs.registry import suggest
-from p2gs.schema import Given, Keys, Plain, check_keys, keys_of, merge
 from p2gs.types import UserError
 
 GT = re.compile(r"gt\s*(?:([+-])\s*(\d+))?")
@@ -236,7 +236,7 @@ class Bench:
 
     def check_settings(self) -> None:
         """Build every setting's config once, so that a mistake is told before anything runs. Raises UserError."""
-        from p2gs.config import load_config
+        from p2gs.config.run import load_config
 
         for name, setting in self.settings.items():
             try:

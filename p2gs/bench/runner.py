@@ -16,7 +16,7 @@ from p2gs.bench.cell import PROGRAM, Outcome, note, run_cell, status
 from p2gs.bench.executors import executor
 from p2gs.bench.live import Display
 from p2gs.bench.plan import Bench, Cell
-from p2gs.config_files import to_yaml
+from p2gs.config.files import to_yaml
 from p2gs.provenance import provenance
 
 POLL = 0.2  # seconds between two looks at the jobs

@@ -7,8 +7,8 @@ from pathlib import Path
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from p2gs.callbacks.base import Callback, due, register_callback, run_folder
+from p2gs.gaussians.sealed import seal
 from p2gs.models.health import LossNotFinite, all_finite
-from p2gs.models.sealed import seal
 
 
 def checkpoint_path(run_dir: Path, phase_name: str) -> Path:

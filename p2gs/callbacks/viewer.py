@@ -31,8 +31,8 @@ class Viewer(Callback):
     def prepare(self, cfg, scene) -> None:
         self._similarity = scene.similarity
         if (self.host, self.port) not in self._stages:
-            from p2gs.export.viewer import Stage
-            from p2gs.export.views import scene_cameras
+            from p2gs.export.pages.viewer import Stage
+            from p2gs.gaussians.views import scene_cameras
 
             stage = self._stages[self.host, self.port] = Stage(f"p2gs {scene.name}", self.host, self.port)
             stage.add_cameras(scene_cameras(scene))
@@ -50,8 +50,8 @@ class Viewer(Callback):
 def as_object(phase, similarity: Similarity) -> Optional[ArticulatedObject]:
     """What a phase has learned so far, in input coordinates; None for a phase that hands over no Gaussians."""
     from p2gs.callbacks.evaluation import current_joints
-    from p2gs.export.frame import gaussians_to_input
-    from p2gs.models.handover import Articulation, CanonicalGaussians, StateGaussians
+    from p2gs.gaussians.frame import gaussians_to_input
+    from p2gs.gaussians.handover import Articulation, CanonicalGaussians, StateGaussians
 
     made = phase.hand_over()
     if not isinstance(made, (Articulation, CanonicalGaussians, StateGaussians)):

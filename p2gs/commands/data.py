@@ -42,7 +42,7 @@ def check(args: argparse.Namespace) -> int:
 
 def synth(args: argparse.Namespace) -> int:
     """Write a generated scene; prints how to train on it."""
-    from p2gs.data.generate import synthesize
+    from p2gs.data.generated.generate import synthesize
 
     given = {"size": args.size, "train_views": args.views, "test_views": args.test_views}
     for name, value in given.items():

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from p2gs.config import RunConfig, config_of
-from p2gs.config_files import overrides_layer, parse_overrides, read_config, to_yaml
+from p2gs.config.files import overrides_layer, parse_overrides, read_config, to_yaml
+from p2gs.config.run import RunConfig, config_of
 from p2gs.registry import suggest
 from p2gs.types import UserError
 
@@ -37,8 +37,8 @@ def fit(args: argparse.Namespace, words: list[str]) -> int:
         raise UserError(f"--only: the config has no phase '{args.only}'{suggest(args.only, cfg.phases)}")
     _ = cfg.data  # a missing data.root is told before anything is written
 
-    from p2gs import pipeline
     from p2gs.callbacks.base import silence_lightning
+    from p2gs.runtime import pipeline
     from p2gs.stopping import heeding_sigterm
 
     silence_lightning()

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from p2gs.config_files import run_values
+from p2gs.config.files import run_values
 from p2gs.registry import load_plugins
 from p2gs.types import UserError
 
@@ -38,13 +38,13 @@ def test(args: argparse.Namespace) -> int:
     from rich import print as rich_print
 
     from p2gs.callbacks.hparams import write_hparams
-    from p2gs.export.evaluate import evaluate_run
-    from p2gs.export.report import write_report
-    from p2gs.export.score_table import score_tables
+    from p2gs.export.pages.report import write_report
+    from p2gs.scores.evaluate import evaluate_run
+    from p2gs.scores.table import score_tables
 
     run = finished_run(args.run)
     if args.truth is not None:
-        from p2gs.export.evaluate_capture import capture_lines, evaluate_capture
+        from p2gs.scores.capture import capture_lines, evaluate_capture
 
         for line in capture_lines(evaluate_capture(run, args.truth, args.root)):
             print(line)
@@ -63,7 +63,7 @@ def predict(args: argparse.Namespace) -> int:
     run = finished_run(args.run)
     if args.size is not None and args.size < 16:
         raise UserError(f"--size: expected at least 16 pixels, got {args.size}")
-    from p2gs.export.states import render_states
+    from p2gs.export.pages.states import render_states
 
     for path in render_states(run, args.times, out=args.out, size=args.size, video=args.video):
         print(path)
@@ -72,7 +72,7 @@ def predict(args: argparse.Namespace) -> int:
 
 def view(args: argparse.Namespace) -> int:
     """The twin in the browser, until Ctrl-C."""
-    from p2gs.export.viewer import serve
+    from p2gs.export.pages.viewer import serve
 
     serve(finished_run(args.run), args.host, args.port)
     return 0
@@ -129,7 +129,7 @@ def _metres_per_unit(args: argparse.Namespace, run: Path) -> float:
 def _check(folder: Path) -> int:
     from rich import print as rich_print
 
-    from p2gs.export.check import check_folder, check_table
+    from p2gs.export.checks.check import check_folder, check_table
 
     results = check_folder(folder)
     rich_print(check_table(results))

@@ -81,8 +81,8 @@ class SyntheticData(TwoStateData):
 
     def read(self) -> TwoStateScene:
         """Raises UserError for an unknown kind, and where ``root`` holds anything but the scene of these arguments."""
-        from p2gs.data.generate import recipe, synthesize
-        from p2gs.data.synthetic import make_object, synthetic_scene
+        from p2gs.data.generated.generate import recipe, synthesize
+        from p2gs.data.generated.synthetic import make_object, synthetic_scene
 
         if self.root is None:
             obj = make_object(self.kind, self.object_seed)

@@ -10,19 +10,19 @@ from typing import Callable, Optional
 import numpy as np
 import torch
 
-from p2gs.export.clearance import clear_links
-from p2gs.export.convex import decompose
-from p2gs.export.inertia import Inertia, effective_inertia, enclosed, inertia_of, joint_load
 from p2gs.export.links import Hinge, Link
-from p2gs.export.mesh import read_meshes, write_meshes
-from p2gs.export.pose import pose
-from p2gs.export.reach import extend_links
-from p2gs.export.simplify import simplify
-from p2gs.export.texture import Texture
-from p2gs.export.twin_json import load_twin
+from p2gs.export.physics.clearance import clear_links
+from p2gs.export.physics.convex import decompose
+from p2gs.export.physics.inertia import Inertia, effective_inertia, enclosed, inertia_of, joint_load
+from p2gs.export.physics.reach import extend_links
+from p2gs.gaussians.pose import pose
+from p2gs.gaussians.twin_json import load_twin
 from p2gs.ops.mesh import Mesh
 from p2gs.ops.sh import rotate_sh
 from p2gs.ops.so3 import matrix_to_quat, quat_multiply
+from p2gs.surface.mesh import read_meshes, write_meshes
+from p2gs.surface.simplify import simplify
+from p2gs.surface.texture import Texture
 from p2gs.types import GaussianTensors, Joint, UserError
 
 DENSITY = 300.0  # kg / m^3 of the convex pieces: chipboard furniture with some air in it

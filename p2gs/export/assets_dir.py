@@ -9,8 +9,8 @@ import numpy as np
 
 from p2gs.export.asset import Asset
 from p2gs.export.links import Link
-from p2gs.export.texture import Texture
-from p2gs.export.tsdf import vertex_normals
+from p2gs.surface.texture import Texture
+from p2gs.surface.tsdf import vertex_normals
 
 FOLDER = "assets"
 

@@ -11,8 +11,8 @@ from p2gs.export.assets_dir import write_obj
 from p2gs.export.metadata import read_meta
 from p2gs.export.naming import with_names
 from p2gs.export.profiles import PROFILE_UP, PROFILES, Context
-from p2gs.export.texture import Baker
 from p2gs.registry import Registry
+from p2gs.surface.texture import Baker
 from p2gs.types import UserError
 
 Exporter = Callable[[Asset, Path], Path]
@@ -26,7 +26,7 @@ FOR_LOOKS = {"glb", "ply", "obj", *SPLATS}  # hold no collision pieces or masses
 @EXPORTERS.register("urdf")
 def urdf(asset: Asset, out: Path) -> Path:
     """twin.urdf with assets/."""
-    from p2gs.export.urdf import write_urdf
+    from p2gs.export.files.urdf import write_urdf
 
     return write_urdf(asset, out)
 
@@ -34,7 +34,7 @@ def urdf(asset: Asset, out: Path) -> Path:
 @EXPORTERS.register("mjcf")
 def mjcf(asset: Asset, out: Path) -> Path:
     """twin.xml with assets/."""
-    from p2gs.export.mjcf import write_mjcf
+    from p2gs.export.files.mjcf import write_mjcf
 
     return write_mjcf(asset, out)
 
@@ -42,7 +42,7 @@ def mjcf(asset: Asset, out: Path) -> Path:
 @EXPORTERS.register("glb")
 def glb(asset: Asset, out: Path) -> Path:
     """twin.glb, animated."""
-    from p2gs.export.glb import write_glb
+    from p2gs.export.files.glb import write_glb
 
     return write_glb(asset, out)
 
@@ -50,7 +50,7 @@ def glb(asset: Asset, out: Path) -> Path:
 @EXPORTERS.register("usd")
 def usd(asset: Asset, out: Path) -> Path:
     """twin.usda with physics joints."""
-    from p2gs.export.usd import write_usd
+    from p2gs.export.files.usd import write_usd
 
     return write_usd(asset, out)
 
@@ -58,7 +58,7 @@ def usd(asset: Asset, out: Path) -> Path:
 @EXPORTERS.register("splats")
 def splats(asset: Asset, out: Path) -> Path:
     """splats.glb: the Gaussians, animated."""
-    from p2gs.export.splats_gltf import write_splats
+    from p2gs.export.files.splats_gltf import write_splats
 
     return write_splats(asset, out)
 
@@ -66,7 +66,7 @@ def splats(asset: Asset, out: Path) -> Path:
 @EXPORTERS.register("spz")
 def spz(asset: Asset, out: Path) -> Path:
     """splats.spz: the Gaussians at the start state, compressed."""
-    from p2gs.export.splats_spz import write_spz
+    from p2gs.export.files.splats_spz import write_spz
 
     return write_spz(asset, out)
 
@@ -74,8 +74,8 @@ def spz(asset: Asset, out: Path) -> Path:
 @EXPORTERS.register("ply")
 def ply(asset: Asset, out: Path) -> Path:
     """parts/<link>.ply at the start state, vertex colours."""
-    from p2gs.export.mesh import write_mesh
     from p2gs.ops.mesh import Mesh
+    from p2gs.surface.mesh import write_mesh
 
     folder = out / "parts"
     folder.mkdir(parents=True, exist_ok=True)

@@ -7,10 +7,10 @@ from typing import Optional
 
 import numpy as np
 
-from p2gs.export.convex import Piece
-from p2gs.export.inertia import Inertia
-from p2gs.export.texture import Texture
+from p2gs.export.physics.convex import Piece
+from p2gs.export.physics.inertia import Inertia
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.texture import Texture
 from p2gs.types import GaussianTensors
 
 HOLD = 0.02  # friction of a joint, in the weight that hangs on it: holds where the axis leans by a degree, as found axes do

@@ -32,7 +32,7 @@ PROFILE_UP = {"partnet": "y"}  # the others stand on z
 @PROFILES.register("mujoco")
 def mujoco(asset: Asset, out: Path, context: Context) -> list[Path]:
     """twin.xml with assets/."""
-    from p2gs.export.mjcf import write_mjcf
+    from p2gs.export.files.mjcf import write_mjcf
 
     return [write_mjcf(asset, out)]
 
@@ -40,7 +40,7 @@ def mujoco(asset: Asset, out: Path, context: Context) -> list[Path]:
 @PROFILES.register("sapien")
 def sapien(asset: Asset, out: Path, context: Context) -> list[Path]:
     """twin.urdf with assets/, without the element that only MuJoCo knows."""
-    from p2gs.export.urdf import write_urdf
+    from p2gs.export.files.urdf import write_urdf
 
     return [write_urdf(asset, out, mujoco=False)]
 
@@ -48,7 +48,7 @@ def sapien(asset: Asset, out: Path, context: Context) -> list[Path]:
 @PROFILES.register("isaac")
 def isaac(asset: Asset, out: Path, context: Context) -> list[Path]:
     """twin.usda with textures/."""
-    from p2gs.export.usd import write_usd
+    from p2gs.export.files.usd import write_usd
 
     return [write_usd(asset, out)]
 
@@ -56,7 +56,7 @@ def isaac(asset: Asset, out: Path, context: Context) -> list[Path]:
 @PROFILES.register("simready")
 def simready(asset: Asset, out: Path, context: Context) -> list[Path]:
     """NAME/usd/NAME.usda with textures, metadata, thumbnail."""
-    from p2gs.export.simready import write_simready
+    from p2gs.export.files.simready import write_simready
 
     return write_simready(asset, out, context.meta, context.run / "twin.json", context.picture)
 
@@ -64,6 +64,6 @@ def simready(asset: Asset, out: Path, context: Context) -> list[Path]:
 @PROFILES.register("partnet")
 def partnet(asset: Asset, out: Path, context: Context) -> list[Path]:
     """mobility.urdf and the other files of PartNet-Mobility."""
-    from p2gs.export.partnet import write_partnet
+    from p2gs.export.files.partnet import write_partnet
 
     return write_partnet(asset, out, context.meta)

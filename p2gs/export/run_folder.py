@@ -7,13 +7,13 @@ import time
 from pathlib import Path
 from typing import Sequence
 
-from p2gs.export.frame import gaussians_to_input, object_to_input
-from p2gs.export.media import scene_photos, write_media
-from p2gs.export.paint import rasterizer_of
-from p2gs.export.pose import pose
-from p2gs.export.splat_ply import write_splat_ply
-from p2gs.export.twin_json import write_twin_json
-from p2gs.export.views import scene_cameras, write_cameras
+from p2gs.export.pages.media import scene_photos, write_media
+from p2gs.gaussians.frame import gaussians_to_input, object_to_input
+from p2gs.gaussians.paint import rasterizer_of
+from p2gs.gaussians.pose import pose
+from p2gs.gaussians.splat_ply import write_splat_ply
+from p2gs.gaussians.twin_json import write_twin_json
+from p2gs.gaussians.views import scene_cameras, write_cameras
 from p2gs.types import ArticulatedObject, TwoStateScene
 
 
@@ -53,8 +53,8 @@ def complete_run(run_dir: Path | str, formats: Sequence[str] = ("urdf", "mjcf", 
     log: told one line a step with its seconds.
     """
     from p2gs.export.formats import export_run
-    from p2gs.export.mesh import write_meshes
-    from p2gs.export.report import write_report
+    from p2gs.export.pages.report import write_report
+    from p2gs.surface.mesh import write_meshes
 
     run_dir = Path(run_dir)
     for name, step in (

@@ -8,21 +8,21 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from p2gs.context import RunContext
 from p2gs.data.base import Visit
+from p2gs.gaussians.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
+from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs, PartState
 from p2gs.models.canonical import carry
-from p2gs.models.context import RunContext
-from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
-from p2gs.models.motion import PartScrews, blend_move, initial_screws
 from p2gs.models.observed_pairs import ObservedPairs
 from p2gs.models.part_head import PartHead, random_embeddings
 from p2gs.models.phase import exponential, register_phase
 from p2gs.models.repel import place_repel_points
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
-from p2gs.models.slots import add_spare
-from p2gs.models.splats import Splats
+from p2gs.motion.screws import PartScrews, blend_move, initial_screws
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
+from p2gs.parts.slots import add_spare
 from p2gs.types import GaussianTensors, UserError
 
 

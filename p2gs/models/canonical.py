@@ -8,8 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from p2gs.models.handover import CanonicalGaussians, PartMotions
-from p2gs.models.matching import beta_weight, farthest_points, hungarian_pairs, motion_clusters, motion_richness
+from p2gs.gaussians.handover import CanonicalGaussians, PartMotions
+from p2gs.motion.matching import beta_weight, farthest_points, hungarian_pairs, motion_clusters, motion_richness
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors, UserError

@@ -7,22 +7,22 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from p2gs.context import RunContext
 from p2gs.data.base import Visit
+from p2gs.gaussians.handover import CanonicalGaussians, PartMotions, StateGaussians
+from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.canonical import CanonicalConfig, fuse, keep_rows, with_static
-from p2gs.models.context import RunContext
-from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.evidence import evidence_of
-from p2gs.models.free_space import SURFACE, explain_by_free_space, hidden_share
-from p2gs.models.handover import CanonicalGaussians, PartMotions, StateGaussians
-from p2gs.models.openings import OpeningsConfig, open_up
-from p2gs.models.owners import hidden_to_owners
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
-from p2gs.models.splats import Splats
 from p2gs.ops import se3
 from p2gs.ops.carry import RigidMoves
+from p2gs.parts.owners import hidden_to_owners
+from p2gs.surface.openings import OpeningsConfig, open_up
 from p2gs.types import GaussianTensors
+from p2gs.visibility.depth_stack import DepthStack
+from p2gs.visibility.evidence import evidence_of
+from p2gs.visibility.free_space import SURFACE, explain_by_free_space, hidden_share
 
 
 @dataclass

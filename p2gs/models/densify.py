@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from p2gs.models.splats import Splats, gather
+from p2gs.gaussians.splats import Splats, gather
 from p2gs.ops.so3 import quat_to_matrix
 
 

@@ -9,21 +9,21 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
+from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.losses.base import Loss
 from p2gs.models.canonical import carry, with_static
-from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.handover import Articulation, PartMotions, StateGaussians
-from p2gs.models.islands import settle_twin_islands
-from p2gs.models.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
-from p2gs.models.joint_range import extend_ranges
-from p2gs.models.refine_motions import Judge, leave_false_minima, refine, single_ways
-from p2gs.models.screw_polish import PolishConfig, photometric_cost
 from p2gs.models.tune import TuneConfig, tune
+from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
+from p2gs.motion.joint_range import extend_ranges
+from p2gs.motion.refine_motions import Judge, leave_false_minima, refine, single_ways
+from p2gs.motion.screw_polish import PolishConfig, photometric_cost
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
+from p2gs.parts.islands import settle_twin_islands
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, Part, Similarity
+from p2gs.visibility.depth_stack import DepthStack
 
-Contents = Callable[[ArticulatedObject, Sequence[tuple[int, Camera]], str], tuple[Tensor, Tensor]]  # ``p2gs.export.contents.in_trays``
+Contents = Callable[[ArticulatedObject, Sequence[tuple[int, Camera]], str], tuple[Tensor, Tensor]]  # ``p2gs.surface.contents.in_trays``
 
 UNKNOWN = 4.0  # a state's Gaussian farther than this from the twin, in the median's units, is none of the twin's
 

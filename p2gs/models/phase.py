@@ -12,10 +12,10 @@ from torch import Tensor
 
 from p2gs.data.base import Visit
 from p2gs.data.views import TrainingViews
+from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs
 from p2gs.models.adam import NamedAdam
 from p2gs.models.health import check_gaussians, check_loss
-from p2gs.models.splats import Splats
 from p2gs.models.stage import PHASES, Stage, register_phase
 from p2gs.native import serial_torch
 from p2gs.render import draws_natively

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from p2gs.data.exposure import brightened, corrected
-from p2gs.models.handover import Registration, StateGaussians, ViewCorrections
+from p2gs.gaussians.handover import Registration, StateGaussians, ViewCorrections
 from p2gs.ops import se3
 from p2gs.ops.carry import Parts, carry
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc

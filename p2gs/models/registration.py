@@ -14,20 +14,20 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from p2gs.context import RunContext
 from p2gs.data.exposure import median_gain
 from p2gs.data.views import TargetImage, TrainingViews
-from p2gs.models.context import RunContext
-from p2gs.models.discovery.evidence import DepthStack, StateEvidence
-from p2gs.models.discovery.surfels import build_surfels
-from p2gs.models.evidence import evidence_of
-from p2gs.models.handover import Registration, StateGaussians
-from p2gs.models.photo_fit import COLOUR, STRUCTURE, PhotoSide, compare, fit_photographs, photograph, unmoved
+from p2gs.gaussians.handover import Registration, StateGaussians
 from p2gs.models.registered import REGISTRATION, dimmed, register_state, register_views, write_registration
 from p2gs.models.stage import Stage, register_phase
-from p2gs.models.surface_fit import fit_surfaces
 from p2gs.models.trial import held_out, trial
+from p2gs.motion.photo_fit import COLOUR, STRUCTURE, PhotoSide, compare, fit_photographs, photograph, unmoved
+from p2gs.motion.surface_fit import fit_surfaces
 from p2gs.ops import se3, so3
 from p2gs.types import GaussianTensors
+from p2gs.visibility.depth_stack import DepthStack, StateEvidence
+from p2gs.visibility.evidence import evidence_of
+from p2gs.visibility.surfels import build_surfels
 
 NOISE = 2e-4  # least noise of surfels, of the box's diagonal: discovery's
 

@@ -12,14 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from p2gs.context import RunContext
 from p2gs.data.base import Visit
 from p2gs.data.views import TrainingViews
+from p2gs.gaussians.handover import StateGaussians
+from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs
-from p2gs.models.context import RunContext
-from p2gs.models.handover import StateGaussians
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, SplatRates, StatePhase
-from p2gs.models.splats import Splats
 from p2gs.render import with_pixels
 
 

@@ -9,20 +9,20 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from p2gs.context import RunContext
 from p2gs.data.base import Visit
 from p2gs.data.views import TrainingViews
+from p2gs.gaussians.draw import render_gaussians
+from p2gs.gaussians.handover import StateGaussians
+from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs, Target
-from p2gs.models.context import RunContext
-from p2gs.models.draw import render_gaussians
-from p2gs.models.handover import StateGaussians
 from p2gs.models.health import check_gaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
 from p2gs.models.phase import Phase, PhaseConfig, exponential, register_phase
 from p2gs.models.registered import correct_scene
-from p2gs.models.splats import Splats
 from p2gs.models.view_fit import ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
-from p2gs.models.visibility import visible_share
 from p2gs.types import Camera, GaussianTensors, RenderOutput, TwoStateScene
+from p2gs.visibility.share import visible_share
 
 
 @dataclass

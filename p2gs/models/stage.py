@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from p2gs.models.context import RunContext
+from p2gs.context import RunContext
 from p2gs.registry import Registry
 
 

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
+from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.adam import NamedAdam
 from p2gs.models.single_state import SplatRates, render_gaussians
-from p2gs.models.splats import Splats
 from p2gs.native import serial_torch
 from p2gs.ops import se3
 from p2gs.ops.carry import RigidMoves

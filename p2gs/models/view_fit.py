@@ -16,11 +16,11 @@ from torch import Tensor, nn
 
 from p2gs.data.exposure import brightened, median_gain
 from p2gs.data.views import TargetImage, TrainingViews
-from p2gs.models.draw import render_gaussians
-from p2gs.models.handover import ViewCorrections
-from p2gs.models.photo_fit import GREY, STRUCTURE, photograph
+from p2gs.gaussians.draw import render_gaussians
+from p2gs.gaussians.handover import ViewCorrections
 from p2gs.models.registered import correct_views
 from p2gs.models.trial import Trial, trial
+from p2gs.motion.photo_fit import GREY, STRUCTURE, photograph
 from p2gs.ops import se3
 from p2gs.ops.ssim import l1_ssim
 from p2gs.types import Camera, GaussianTensors, View

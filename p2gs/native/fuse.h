@@ -1,4 +1,4 @@
-// Depth maps averaged into a truncated signed distance field (see p2gs/export/integrate.py).
+// Depth maps averaged into a truncated signed distance field (see p2gs/surface/integrate.py).
 #pragma once
 
 #include <cstdint>

@@ -9,7 +9,7 @@ namespace p2gs {
 
 constexpr int kSurfel = 12;  // floats of a surfel: point, normal, colour, 1 where it is known to be static, two unused
 
-// One state as p2gs.models.discovery.fields.Landing describes it.
+// One state as p2gs.motion.discovery.fields.Landing describes it.
 struct LandingTables {
     const int32_t* nearest;   // [27][coarse voxels] a surfel
     const float* depth_free;  // [fine voxels]

@@ -1,4 +1,4 @@
-// How rigidly carried Gaussians pull at their parts: a loss's gradient by small motions of each part (p2gs/models/part_pull.py).
+// How rigidly carried Gaussians pull at their parts: a loss's gradient by small motions of each part (p2gs/motion/part_pull.py).
 #pragma once
 
 #include <cstdint>

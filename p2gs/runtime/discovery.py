@@ -5,12 +5,12 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from p2gs.models.context import RunContext
-from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.part_motions import DiscoveryStage as DiscoveryOptions
-from p2gs.models.part_motions import find_part_motions
-from p2gs.models.slots import merge_to
+from p2gs.context import RunContext
+from p2gs.gaussians.handover import PartMotions, StateGaussians
+from p2gs.models.part_discovery import DiscoveryStage as DiscoveryOptions
+from p2gs.models.part_discovery import find_part_motions
 from p2gs.models.stage import Stage, register_phase
+from p2gs.parts.slots import merge_to
 
 
 @register_phase("discovery")

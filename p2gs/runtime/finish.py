@@ -6,11 +6,11 @@ from __future__ import annotations
 import json
 from functools import partial
 
-from p2gs.models.context import RunContext
+from p2gs.context import RunContext
+from p2gs.gaussians.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
 from p2gs.models.finish import FinishConfig, finish
-from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
-from p2gs.models.slots import slot_report
 from p2gs.models.stage import Stage, register_phase
+from p2gs.parts.slots import slot_report
 
 
 @register_phase("finish")
@@ -38,10 +38,10 @@ class FinishStage(Stage):
         sharpened: list[StateGaussians] | None = None,
         motions: PartMotions | None = None,
     ) -> dict:
-        from p2gs.export.contents import in_trays
-        from p2gs.export.diagnostics_page import write_diagnosis
+        from p2gs.diagnosis.measures import StageResults
+        from p2gs.diagnosis.page import write_diagnosis
         from p2gs.export.run_folder import complete_run, write_twin
-        from p2gs.models.diagnosis import StageResults
+        from p2gs.surface.contents import in_trays
 
         config, found_in, states = section.config, states, sharpened or states
         backend = {"backend": run.backend, "twin_backend": run.rasterizer, "device": run.device}

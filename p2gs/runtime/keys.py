@@ -10,10 +10,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Iterable
 
-from p2gs.models.context import RunContext
+from p2gs.config.trainer import callback_modules, decides_result
+from p2gs.context import RunContext
 from p2gs.models.stage import Stage
 from p2gs.runtime.code import CodeReader
-from p2gs.trainer_options import callback_modules, decides_result
 
 MOST_TOLD = 3  # differences in a sentence
 LIBRARIES = ("torch", "lightning", "typing", "abc")  # of which phases inherit; their code counts as given

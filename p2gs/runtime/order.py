@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from p2gs.models.context import RunContext
+from p2gs.context import RunContext
 from p2gs.models.stage import PHASES, Stage
 from p2gs.registry import suggest
 from p2gs.types import UserError

@@ -9,12 +9,12 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.plugins.environments import LightningEnvironment  # pyright: ignore[reportPrivateImportUsage]
 
-from p2gs.models.context import RunContext
+from p2gs.config.trainer import trainer_arguments
+from p2gs.context import RunContext
+from p2gs.gaussians.sealed import check_seal
 from p2gs.models.phase import Phase
-from p2gs.models.sealed import check_seal
 from p2gs.models.stage import Stage
 from p2gs.stopping import at_step_ends
-from p2gs.trainer_options import trainer_arguments
 
 
 def train(run: RunContext, cls: type[Stage], stage: str, section: Any, key: str, given: dict) -> Any:

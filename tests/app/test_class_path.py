@@ -7,7 +7,7 @@ import sys
 import pytest
 import yaml
 
-from p2gs.config import load_config, save_config
+from p2gs.config.run import load_config, save_config
 from p2gs.types import UserError
 
 CLASSES = """
@@ -38,7 +38,7 @@ class Stranger:
 def desk(tmp_path, monkeypatch):
     """A working directory with own_classes.py; nothing of it stays in the registries."""
     from p2gs.callbacks.base import CALLBACKS
-    from p2gs.config import import_builtins
+    from p2gs.config.run import import_builtins
     from p2gs.data.base import DATASETS
     from p2gs.losses.base import LOSSES
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from p2gs.config import load_config, save_config
+from p2gs.config.run import load_config, save_config
 from p2gs.types import UserError
 
 BASE = """
@@ -173,7 +173,7 @@ def test_saved_config_reads_back_the_same(base, tmp_path):
 
 
 def test_our_own_configs_are_found_from_anywhere(fakes, tmp_path, monkeypatch):
-    from p2gs.config_files import find_config
+    from p2gs.config.files import find_config
 
     monkeypatch.chdir(tmp_path)
     assert find_config("base.yaml") == find_config("configs/base.yaml") == find_config("base")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from p2gs.config import load_config
+from p2gs.config.run import load_config
 from p2gs.types import UserError
 
 MISTAKES = [

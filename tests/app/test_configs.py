@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from p2gs.config import load_config
+from p2gs.config.run import load_config
 
 REPOSITORY = Path(__file__).parents[2]
 CONFIGS = REPOSITORY / "configs"

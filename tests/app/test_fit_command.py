@@ -21,10 +21,10 @@ class Mine(Loss):
 
 @pytest.fixture
 def pipeline(monkeypatch):
-    """In place of p2gs.pipeline: notes what it is given."""
+    """In place of p2gs.runtime.pipeline: notes what it is given."""
     calls = []
     module = SimpleNamespace(run=lambda cfg, only=None, keep_stale=False: calls.append((cfg, only)) or cfg.run_dir)
-    monkeypatch.setitem(sys.modules, "p2gs.pipeline", module)
+    monkeypatch.setitem(sys.modules, "p2gs.runtime.pipeline", module)
     monkeypatch.setattr(sys.modules["p2gs"], "pipeline", module, raising=False)
     return calls
 

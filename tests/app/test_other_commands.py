@@ -13,8 +13,8 @@ from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory):
     """A run folder with two clouds of Gaussians, the second sliding 0.5 along x; and its object."""
-    from p2gs.export.splat_ply import write_splat_ply
-    from p2gs.export.twin_json import write_twin_json
+    from p2gs.gaussians.splat_ply import write_splat_ply
+    from p2gs.gaussians.twin_json import write_twin_json
 
     gen = torch.Generator().manual_seed(0)
     n = 60
@@ -73,8 +73,8 @@ def test_what_the_viewer_draws(twin):
     """Centres carried by a part's frame, and covariances, are those of the posed twin."""
     from types import SimpleNamespace
 
-    from p2gs.export.pose import pose
-    from p2gs.export.viewer import place, splat_arrays
+    from p2gs.export.pages.viewer import place, splat_arrays
+    from p2gs.gaussians.pose import pose
     from p2gs.ops.so3 import quat_to_matrix
 
     _, obj = twin
@@ -91,7 +91,7 @@ def test_what_the_viewer_draws(twin):
 
 def test_viewer_in_the_browser(twin):
     pytest.importorskip("viser", reason="viser is not installed (pip install p2gs[viewer])")
-    from p2gs.export.viewer import open_viewer
+    from p2gs.export.pages.viewer import open_viewer
 
     server = open_viewer(twin[0], port=18080)
     try:

@@ -11,9 +11,9 @@ import torch
 
 from p2gs.app import parser
 from p2gs.callbacks.viewer import Viewer
-from p2gs.config import load_config
-from p2gs.models import handover
-from p2gs.models.sealed import Damaged, check_seal, seal
+from p2gs.config.run import load_config
+from p2gs.gaussians import handover
+from p2gs.gaussians.sealed import Damaged, check_seal, seal
 from p2gs.types import GaussianTensors, UserError
 
 PACKAGE = Path(__file__).parents[2] / "p2gs"
@@ -92,7 +92,7 @@ def test_a_config_that_would_run_something_is_refused(tmp_path):
 
 def test_an_option_that_holds_anything_makes_no_object(tmp_path):
     from p2gs.bench.plan import BenchOptions
-    from p2gs.schema import Given
+    from p2gs.config.schema import Given
 
     proof = tmp_path / "ran"
     told = {"class_path": "subprocess.Popen", "init_args": {"args": ["touch", str(proof)]}}
@@ -123,9 +123,9 @@ EVIL = "<script>alert(1)<x>"
 
 
 def test_names_are_text_in_the_report(tmp_path):
-    from p2gs.export.report import write_report
-    from p2gs.export.splat_ply import write_splat_ply
-    from p2gs.export.twin_json import write_twin_json
+    from p2gs.export.pages.report import write_report
+    from p2gs.gaussians.splat_ply import write_splat_ply
+    from p2gs.gaussians.twin_json import write_twin_json
 
     run, obj = tmp_path / EVIL, one_part()
     write_splat_ply(run / "splats" / "canonical.ply", obj.gaussians, obj.part_ids)
@@ -139,7 +139,7 @@ def test_names_are_text_in_the_report(tmp_path):
 
 
 def test_a_part_is_no_markup(tmp_path):
-    from p2gs.export.twin_json import read_twin_json
+    from p2gs.gaussians.twin_json import read_twin_json
 
     joint = {"type": EVIL, "axis": [0, 0, 1], "origin": [0, 0, 0], "motion": 1, "limits": [0, 1], "transform": torch.eye(4).tolist()}
     parts = [{"id": 0, "kind": "static"}, {"id": 1, "kind": "movable", "joint": joint}]
@@ -156,7 +156,7 @@ def one_part():
 
 
 def test_the_viewer_is_for_this_machine_unless_told():
-    from p2gs.export.viewer import Stage, open_viewer
+    from p2gs.export.pages.viewer import Stage, open_viewer
 
     hosts = {parser().parse_args(["view", "RUN"]).host, Viewer().host}
     hosts |= {inspect.signature(f).parameters["host"].default for f in (Stage.__init__, open_viewer)}

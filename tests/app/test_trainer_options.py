@@ -6,8 +6,8 @@ import pytest
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.profilers import SimpleProfiler
 
-from p2gs.config import load_config
-from p2gs.trainer_options import callback_modules, check_trainer_options, decides_result, trainer_arguments
+from p2gs.config.run import load_config
+from p2gs.config.trainer import callback_modules, check_trainer_options, decides_result, trainer_arguments
 from p2gs.types import UserError
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from p2gs.config import load_config
-from p2gs.schema import keys_of
+from p2gs.config.run import load_config
+from p2gs.config.schema import keys_of
 from p2gs.types import UserError
 
 FOLDER = Path(__file__).parents[2] / "configs" / "ablation"
@@ -89,8 +89,8 @@ def test_a_wrong_switch_is_told():
 def test_no_canonical_hands_over_the_start_state_as_it_is():
     import torch
 
+    from p2gs.gaussians.handover import PartMotions
     from p2gs.models.canonical import CanonicalConfig, fuse
-    from p2gs.models.handover import PartMotions
     from p2gs.types import GaussianTensors
 
     def cloud(n, seed):

@@ -5,14 +5,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from p2gs.config import load_config
-from p2gs.models import handover
+from p2gs.config.run import load_config
+from p2gs.gaussians import handover
+from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.models.articulation import ArticulationPhase
 from p2gs.models.canonical import CanonicalConfig, fuse
-from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.slots import merge_to
 from p2gs.ops import se3
-from p2gs.pipeline import Pipeline
+from p2gs.parts.slots import merge_to
+from p2gs.runtime.pipeline import Pipeline
 from p2gs.types import GaussianTensors, UserError
 
 NAMES = sorted(p.stem for p in (Path(__file__).parents[2] / "configs" / "ablation").glob("*.yaml"))

@@ -16,7 +16,7 @@ from p2gs.callbacks.evaluation import Evaluation
 from p2gs.callbacks.previews import Previews
 from p2gs.callbacks.progress import Progress, duration, status_line
 from p2gs.callbacks.tensorboard import Images, Scalars
-from p2gs.models.sealed import check_seal
+from p2gs.gaussians.sealed import check_seal
 
 
 class TinyPhase(LightningModule):
@@ -245,7 +245,7 @@ def test_evaluation_finds_ground_truth_and_logs_joint_errors(tmp_path):
     """A door that the phase has learned 1 degree short, in internal units of another scale and place than the input's."""
     import math
 
-    from p2gs.models.handover import Articulation
+    from p2gs.gaussians.handover import Articulation
     from p2gs.types import GaussianTensors, Similarity
 
     truth = {"axis": {"o": [1.0, 0, 0], "d": [0, 0, 1]}, "type": "rotate", "rotate": {"l": 0, "r": 60}}

@@ -5,7 +5,7 @@ import json
 import yaml
 
 from p2gs.callbacks.hparams import Families, layout, run_parameters, run_scores, write_hparams
-from p2gs.config import load_config
+from p2gs.config.run import load_config
 from p2gs.losses.base import LOSSES, Loss
 
 WORDS = ["--data.format", "artgs", "--data.root", "/somewhere/storage4", "--seed", "7"]

@@ -9,8 +9,8 @@ import torch
 
 from p2gs.callbacks.base import CALLBACKS
 from p2gs.callbacks.viewer import Viewer, as_object
-from p2gs.config import load_config
-from p2gs.models.handover import Articulation, CanonicalGaussians, StateGaussians
+from p2gs.config.run import load_config
+from p2gs.gaussians.handover import Articulation, CanonicalGaussians, StateGaussians
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors, Similarity, UserError
 

@@ -9,10 +9,10 @@ from p2gs.data.capture.coarse import Picture, fit, initial, object_rows, region_
 from p2gs.data.capture.given_masks import folder_masks, shown
 from p2gs.data.capture.model import Lens
 from p2gs.data.capture.photos import Shot
-from p2gs.data.raytrace import render
-from p2gs.data.shapes import box
-from p2gs.data.synthetic import look_at
-from p2gs.data.textures import Texture
+from p2gs.data.generated.raytrace import render
+from p2gs.data.generated.shapes import box
+from p2gs.data.generated.synthetic import look_at
+from p2gs.data.generated.textures import Texture
 from p2gs.types import Camera, UserError
 
 K = np.array([[110.0, 0, 64], [0, 110, 48], [0, 0, 1]])

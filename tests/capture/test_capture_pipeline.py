@@ -14,11 +14,11 @@ from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
 from p2gs.data.capture.model import Lens, Model, Photo
 from p2gs.data.check import check_dataset
-from p2gs.data.raytrace import render
-from p2gs.data.shapes import box
-from p2gs.data.synthetic import look_at
-from p2gs.data.textures import Texture
-from p2gs.export.evaluate_capture import camera_pairs, moved_joint, rigid_between
+from p2gs.data.generated.raytrace import render
+from p2gs.data.generated.shapes import box
+from p2gs.data.generated.synthetic import look_at
+from p2gs.data.generated.textures import Texture
+from p2gs.scores.capture import camera_pairs, moved_joint, rigid_between
 from p2gs.types import Joint, UserError
 
 LENS = Lens("PINHOLE", 320, 240, np.array([280.0, 280, 160, 120]))

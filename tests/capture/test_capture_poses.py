@@ -11,7 +11,7 @@ from p2gs.data.capture.colmap_io import read_model, write_model
 from p2gs.data.capture.model import Lens, Model, Photo, similarity
 from p2gs.data.capture.photos import copy_photos
 from p2gs.data.capture.poses import onto_copies, read_poses
-from p2gs.data.synthetic import look_at
+from p2gs.data.generated.synthetic import look_at
 from p2gs.types import UserError
 
 LENS = Lens("OPENCV", 320, 240, np.array([300.0, 302, 161, 119, -0.05, 0.01, 0.001, -0.001]))

@@ -14,7 +14,7 @@ from p2gs.data.capture.hypotheses import State, find_hypotheses
 from p2gs.data.capture.joint import END_OFFSET, filtered, guided_pairs, merged, state_bias, states_of
 from p2gs.data.capture.model import Lens, Model, Photo
 from p2gs.data.capture.static import choose
-from p2gs.data.synthetic import look_at
+from p2gs.data.generated.synthetic import look_at
 from p2gs.types import UserError
 
 LENS = Lens("OPENCV", 960, 720, np.array([750.0, 750, 480, 360, -0.04, 0.01, 0, 0]))

@@ -7,8 +7,8 @@ import shutil
 import pytest
 import torch
 
-from p2gs.data.synthetic import make_object, synthetic_scene
-from p2gs.data.write import write_scene
+from p2gs.data.generated.synthetic import make_object, synthetic_scene
+from p2gs.data.generated.write import write_scene
 
 SIZE, TRAIN, TEST = 40, 8, 2
 

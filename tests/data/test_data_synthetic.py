@@ -7,14 +7,14 @@ import pytest
 import torch
 import trimesh
 
-from p2gs.data.generate import synthesize
+from p2gs.data.generated.generate import synthesize
+from p2gs.data.generated.raytrace import Shadow, render
+from p2gs.data.generated.shapes import Primitive, ball, box, cylinder
+from p2gs.data.generated.synthetic import KINDS, cabinet, intrinsics, look_at, make_object, render_view, train_cameras
+from p2gs.data.generated.textures import PATTERNS, Texture
+from p2gs.data.generated.write import write_scene
 from p2gs.data.ground_truth import load_ground_truth
 from p2gs.data.modules import DATASETS, SyntheticData
-from p2gs.data.raytrace import Shadow, render
-from p2gs.data.shapes import Primitive, ball, box, cylinder
-from p2gs.data.synthetic import KINDS, cabinet, intrinsics, look_at, make_object, render_view, train_cameras
-from p2gs.data.textures import PATTERNS, Texture
-from p2gs.data.write import write_scene
 from p2gs.types import UserError
 
 PLAIN = Texture("noise", (0.8, 0.5, 0.3), (0.4, 0.3, 0.2))
@@ -236,7 +236,7 @@ def test_synthesize_refuses_and_leaves_nothing_behind(tmp_path, monkeypatch):
     def interrupted(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("p2gs.data.write.write_ground_truth", interrupted)
+    monkeypatch.setattr("p2gs.data.generated.write.write_ground_truth", interrupted)
     with pytest.raises(KeyboardInterrupt):
         synthesize(tmp_path / "b", size=16, train_views=1, test_views=0)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["full"]

@@ -7,8 +7,8 @@ import shutil
 import pytest
 
 from p2gs.app import run
-from p2gs.config import load_config
-from p2gs.config_files import read_config
+from p2gs.config.files import read_config
+from p2gs.config.run import load_config
 from p2gs.data.check import check_dataset
 from p2gs.data.modules import DATASETS
 from p2gs.types import UserError

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from p2gs.data.articulated import SyntheticObject, SyntheticPart, prismatic, revolute
-from p2gs.data.furniture import box
-from p2gs.data.raytrace import trace
-from p2gs.data.synthetic import intrinsics, train_cameras
-from p2gs.data.textures import Texture
-from p2gs.models.discovery import StateEvidence
+from p2gs.data.generated.articulated import SyntheticObject, SyntheticPart, prismatic, revolute
+from p2gs.data.generated.furniture import box
+from p2gs.data.generated.raytrace import trace
+from p2gs.data.generated.synthetic import intrinsics, train_cameras
+from p2gs.data.generated.textures import Texture
+from p2gs.motion.discovery import StateEvidence
 from p2gs.types import Camera
 
 PLAIN = Texture("noise", (0.6, 0.6, 0.6), (0.5, 0.5, 0.5), 0.2, 1)

@@ -7,8 +7,8 @@ import pytest
 import torch
 from boxes import PLAIN, both, box, door, drawer, shell
 
-from p2gs.data.articulated import SyntheticObject, SyntheticPart, prismatic
-from p2gs.models.discovery import DiscoveryConfig, StateEvidence, discover, instead_of, places_changed
+from p2gs.data.generated.articulated import SyntheticObject, SyntheticPart, prismatic
+from p2gs.motion.discovery import DiscoveryConfig, StateEvidence, discover, instead_of, places_changed
 from p2gs.types import UserError
 
 SMALL = DiscoveryConfig(surfels=4000, samples=250, candidates=2)

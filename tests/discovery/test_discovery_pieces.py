@@ -10,18 +10,18 @@ import pytest
 import torch
 from boxes import both, door, drawer, shell
 
-from p2gs.models.discovery.amounts import parted
-from p2gs.models.discovery.config import DiscoveryConfig
-from p2gs.models.discovery.evidence import DepthStack, classify
-from p2gs.models.discovery.finish import Explanation
-from p2gs.models.discovery.labels import REVEALED, Graph, Labelling, label, unary
-from p2gs.models.discovery.pipeline import as_motions, discover, ranked, relabel, static_axes, total_score
-from p2gs.models.discovery.problem import build_problem, evidence_masks
-from p2gs.models.discovery.refine import pattern_search
-from p2gs.models.discovery.rigid import Motions
-from p2gs.models.discovery.search import Search
-from p2gs.models.discovery.surfels import Surfels, window_planes
-from p2gs.models.discovery.verify import violation
+from p2gs.motion.discovery.amounts import parted
+from p2gs.motion.discovery.config import DiscoveryConfig
+from p2gs.motion.discovery.finish import Explanation
+from p2gs.motion.discovery.labels import REVEALED, Graph, Labelling, label, unary
+from p2gs.motion.discovery.pipeline import as_motions, discover, ranked, relabel, static_axes, total_score
+from p2gs.motion.discovery.problem import build_problem, evidence_masks
+from p2gs.motion.discovery.refine import pattern_search
+from p2gs.motion.discovery.rigid import Motions
+from p2gs.motion.discovery.search import Search
+from p2gs.motion.discovery.verify import violation
+from p2gs.visibility.depth_stack import DepthStack, classify
+from p2gs.visibility.surfels import Surfels, window_planes
 
 
 def counts_naive(stack: DepthStack, points, tau):

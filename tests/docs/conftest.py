@@ -13,7 +13,7 @@ import pytest
 def desk(tmp_path, monkeypatch):
     """An empty working directory; plugins registered and modules imported from it are forgotten afterwards."""
     from p2gs.callbacks.base import CALLBACKS
-    from p2gs.config import import_builtins
+    from p2gs.config.run import import_builtins
     from p2gs.data.base import DATASETS
     from p2gs.losses.base import LOSSES
     from p2gs.models.stage import PHASES
@@ -39,7 +39,7 @@ def desk(tmp_path, monkeypatch):
 @pytest.fixture(scope="session")
 def photographs():
     """The demo cabinet in 8 views a state, 48 pixels."""
-    from p2gs.data.synthetic import make_object, synthetic_scene
+    from p2gs.data.generated.synthetic import make_object, synthetic_scene
 
     return synthetic_scene(make_object("demo", 0), 48, 8, 0, 0)
 
@@ -50,7 +50,7 @@ def capture(photographs):
     import cv2
     import numpy as np
 
-    from p2gs.data.write import opengl_c2w
+    from p2gs.data.generated.write import opengl_c2w
 
     def write(folder: Path, **lens) -> None:
         for state, name in enumerate(("start", "end")):

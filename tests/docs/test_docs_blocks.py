@@ -13,7 +13,7 @@ from docs_pages import PAGES, REPOSITORY, blocks, page_commands, write_files
 
 from p2gs.app import parser
 from p2gs.cli import main
-from p2gs.config import load_config
+from p2gs.config.run import load_config
 
 README = REPOSITORY / "README.md"
 EXTENDING = [p for p in PAGES if p.stem.startswith("add_")]

@@ -50,7 +50,7 @@ def test_by_entry_point(files, capsys, monkeypatch):
 def test_it_computes_and_can_be_overridden(files, capsys):
     import torch
 
-    from p2gs.config import load_config
+    from p2gs.config.run import load_config
     from p2gs.losses.base import LossInputs
     from p2gs.types import GaussianTensors
 

@@ -33,11 +33,11 @@ def run(tmp_path_factory):
     import numpy as np
     import trimesh
 
-    from p2gs.config import load_config
-    from p2gs.data.generate import synthesize
-    from p2gs.export.mesh import write_mesh
+    from p2gs.config.run import load_config
+    from p2gs.data.generated.generate import synthesize
     from p2gs.export.run_folder import write_twin
     from p2gs.ops.mesh import Mesh
+    from p2gs.surface.mesh import write_mesh
 
     folder = tmp_path_factory.mktemp("results")
     scene = synthesize(folder / "scene", kind="demo", size=48, train_views=6, test_views=2)
@@ -72,7 +72,7 @@ def test_twin_json(run):
 
 
 def test_metrics_json(run):
-    from p2gs.export.evaluate import evaluate_run
+    from p2gs.scores.evaluate import evaluate_run
 
     made, told = evaluate_run(run), documented("metrics.json")
     assert made["joints"]["failures"] < 2, "one joint has to match for its errors to have keys"

@@ -8,10 +8,10 @@ import numpy as np
 import trimesh
 from toy import toy_scene, toy_twin
 
-from p2gs.export.mesh import write_mesh
-from p2gs.export.pose import part_transform
 from p2gs.export.run_folder import write_twin
+from p2gs.gaussians.pose import part_transform
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.mesh import write_mesh
 
 WALL = 0.03
 SHELL = [

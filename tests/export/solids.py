@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import linprog
 
-from p2gs.export.convex import Piece
+from p2gs.export.physics.convex import Piece
 
 
 def intersect(a: Piece, b: Piece, margin: float = 0.0) -> bool:

@@ -5,10 +5,10 @@ import pytest
 import trimesh
 from solids import intersect
 
-from p2gs.export.clearance import GAP, clear_links, without
-from p2gs.export.convex import Piece, cut, hull, separation
-from p2gs.export.inertia import Inertia
 from p2gs.export.links import Hinge, Link, joint_motion
+from p2gs.export.physics.clearance import GAP, clear_links, without
+from p2gs.export.physics.convex import Piece, cut, hull, separation
+from p2gs.export.physics.inertia import Inertia
 from p2gs.ops.mesh import Mesh
 
 

@@ -6,11 +6,11 @@ import torch
 from test_openings import panel
 from toy import ring
 
-from p2gs.export.contents import belongs, beside, in_trays, out_of_body
-from p2gs.export.pose import pose
-from p2gs.export.trays import Front, Tray
+from p2gs.gaussians.pose import pose
 from p2gs.models.finish import assemble
 from p2gs.ops import se3
+from p2gs.surface.contents import belongs, beside, in_trays, out_of_body
+from p2gs.surface.trays import Front, Tray
 from p2gs.types import GaussianTensors, Similarity
 
 GREY = [0.5, 0.5, 0.5]

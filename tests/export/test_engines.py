@@ -9,20 +9,20 @@ from test_clearance import block, cabinet, link, slide
 
 from p2gs.app import run
 from p2gs.export.asset import Asset
-from p2gs.export.check import check_folder
-from p2gs.export.clearance import clear_links
-from p2gs.export.convex import decompose
-from p2gs.export.engines import ENGINES, check_engine, installed, joint_facts, run_engine
-from p2gs.export.inertia import Inertia
-from p2gs.export.mjcf import write_mjcf
-from p2gs.export.urdf import write_urdf
+from p2gs.export.checks.check import check_folder
+from p2gs.export.checks.engines import ENGINES, check_engine, installed, joint_facts, run_engine
+from p2gs.export.files.mjcf import write_mjcf
+from p2gs.export.files.urdf import write_urdf
+from p2gs.export.physics.clearance import clear_links
+from p2gs.export.physics.convex import decompose
+from p2gs.export.physics.inertia import Inertia
 from p2gs.ops.mesh import Mesh
 from p2gs.types import UserError
 
 
 def with_looks(links):
     """Each link's first piece also as what it shows, and masses of wood."""
-    from p2gs.export.inertia import effective_inertia, inertia_of
+    from p2gs.export.physics.inertia import effective_inertia, inertia_of
 
     out = []
     for one in links:

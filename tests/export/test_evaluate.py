@@ -11,14 +11,14 @@ import trimesh
 from toy import start_parts, toy_scene, toy_twin
 
 from p2gs.data.ground_truth import GroundTruth, MeshPaths
-from p2gs.export import evaluate
-from p2gs.export.frame import object_to_input
-from p2gs.export.mesh import write_meshes
-from p2gs.export.paint import draw
-from p2gs.export.pose import pose
 from p2gs.export.run_folder import write_twin
-from p2gs.export.score_table import score_tables
+from p2gs.gaussians.frame import object_to_input
+from p2gs.gaussians.paint import draw
+from p2gs.gaussians.pose import pose
 from p2gs.metrics.views import evaluate_view
+from p2gs.scores import evaluate
+from p2gs.scores.table import score_tables
+from p2gs.surface.mesh import write_meshes
 from p2gs.types import TwoStateScene, UserError
 
 

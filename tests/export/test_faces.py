@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from p2gs.export.faces import Faces, quantile
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.faces import Faces, quantile
 
 
 def test_faces_are_where_and_as_large_as_trimesh_says_in_any_frame():

@@ -5,14 +5,14 @@ import pytest
 import torch
 from toy import ring, toy_scene, toy_twin
 
-from p2gs.export.frame import object_to_input
-from p2gs.export.media import framed, render_parts, render_plain
-from p2gs.export.paint import draw, joint_strokes, part_coloured
-from p2gs.export.pose import pose
+from p2gs.export.pages.media import framed, render_parts, render_plain
+from p2gs.export.pages.states import render_states
 from p2gs.export.run_folder import write_twin
-from p2gs.export.states import render_states
-from p2gs.export.twin_json import load_twin
-from p2gs.export.views import best_camera, bounds, orbit, point_labels, read_cameras, scene_cameras
+from p2gs.gaussians.frame import object_to_input
+from p2gs.gaussians.paint import draw, joint_strokes, part_coloured
+from p2gs.gaussians.pose import pose
+from p2gs.gaussians.twin_json import load_twin
+from p2gs.gaussians.views import best_camera, bounds, orbit, point_labels, read_cameras, scene_cameras
 from p2gs.ops.palette import part_colour
 from p2gs.types import Similarity, UserError
 
@@ -57,7 +57,7 @@ def test_write_twin_leaves_the_contract(run):
 
 
 def test_posed_splats_are_the_states(run):
-    from p2gs.export.splat_ply import read_splat_ply
+    from p2gs.gaussians.splat_ply import read_splat_ply
 
     twin = object_to_input(toy_twin())
     for name, t in (("start", 0.0), ("end", 1.0)):
@@ -171,7 +171,7 @@ def test_render_states_writes_any_time(run, tmp_path):
 def test_gifs_can_be_opened(tmp_path):
     from PIL import Image
 
-    from p2gs.export.video import write_gif
+    from p2gs.export.pages.video import write_gif
 
     ramp = np.tile(np.linspace(0, 255, 64).astype(np.uint8)[None, :, None], (32, 1, 3))
     frames = [np.roll(ramp, 4 * i, axis=1) for i in range(8)]
@@ -182,7 +182,7 @@ def test_gifs_can_be_opened(tmp_path):
 def test_h264_where_imageio_ffmpeg_is_there(tmp_path):
     """Browsers and slides take H.264 with 4:2:0 chroma and nothing else."""
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed (pip install p2gs[video])")
-    from p2gs.export.video import write_video
+    from p2gs.export.pages.video import write_video
 
     ramp = np.tile(np.linspace(0, 255, 64).astype(np.uint8)[None, :, None], (32, 1, 3))
     (path,) = write_video(tmp_path, [np.roll(ramp, 4 * i, axis=1) for i in range(24)])
@@ -199,7 +199,7 @@ def test_gif_and_frames_where_it_is_not(tmp_path, monkeypatch):
     import cv2
     from PIL import Image
 
-    from p2gs.export.video import write_video
+    from p2gs.export.pages.video import write_video
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     frames = [np.full((32, 64, 3), 10 * i, np.uint8) for i in range(6)]
@@ -213,7 +213,7 @@ def test_pictures_are_drawn_with_the_runs_rasterizer(run, tmp_path):
     """A rasterizer of the user's own, named in the run's config, draws every picture of predict."""
     import shutil
 
-    from p2gs.export.paint import RASTERIZER, rasterizer_of
+    from p2gs.gaussians.paint import RASTERIZER, rasterizer_of
     from p2gs.render import RASTERIZERS, find_rasterizer
 
     calls = []

@@ -9,16 +9,16 @@ import trimesh
 from scipy.spatial import cKDTree
 from toy import look_at, ring, start_parts, toy_scene, toy_twin
 
-from p2gs.export.depth_view import DepthView, add_normals, camera_rays
-from p2gs.export.frame import object_to_input
-from p2gs.export.mesh import mesh_cameras, part_meshes, read_mesh, write_mesh, write_meshes
-from p2gs.export.paint import part_coloured
-from p2gs.export.pose import pose
 from p2gs.export.run_folder import write_twin
-from p2gs.export.sightings import PartView, beside_others, fog_limit, look, start_motion, trust
-from p2gs.export.tsdf import ActiveGrid, fuse
-from p2gs.export.views import scene_cameras
+from p2gs.gaussians.frame import object_to_input
+from p2gs.gaussians.paint import part_coloured
+from p2gs.gaussians.pose import pose
+from p2gs.gaussians.views import scene_cameras
 from p2gs.ops.mesh import Mesh, largest_components
+from p2gs.surface.depth_view import DepthView, add_normals, camera_rays
+from p2gs.surface.mesh import mesh_cameras, part_meshes, read_mesh, write_mesh, write_meshes
+from p2gs.surface.sightings import PartView, beside_others, fog_limit, look, start_motion, trust
+from p2gs.surface.tsdf import ActiveGrid, fuse
 from p2gs.types import GaussianTensors, UserError
 
 EYE = torch.eye(4, dtype=torch.float64)

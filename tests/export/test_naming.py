@@ -11,9 +11,9 @@ from test_clearance import slide, turn
 from p2gs.app import run as p2gs
 from p2gs.export.asset import Asset
 from p2gs.export.formats import export_run
-from p2gs.export.inertia import Inertia
 from p2gs.export.links import Hinge, Link
 from p2gs.export.naming import parse_names, with_names
+from p2gs.export.physics.inertia import Inertia
 from p2gs.ops.mesh import Mesh
 from p2gs.types import UserError
 

@@ -7,9 +7,9 @@ from toy import toy_scene, toy_twin
 
 from p2gs.app import run as p2gs
 from p2gs.export.asset import DENSITIES, load_asset, start_box
-from p2gs.export.mesh import write_meshes
 from p2gs.export.run_folder import write_twin
 from p2gs.export.sizes import unlikely_size
+from p2gs.surface.mesh import write_meshes
 from p2gs.types import Similarity
 
 

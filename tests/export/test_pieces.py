@@ -7,9 +7,9 @@ import trimesh
 from toy import ring
 from traced import boards, seen
 
-from p2gs.export.pieces import Piece, bridge, join_pieces
-from p2gs.export.tsdf import fuse
 from p2gs.ops.mesh import Mesh, connected, largest_components
+from p2gs.surface.pieces import Piece, bridge, join_pieces
+from p2gs.surface.tsdf import fuse
 
 VOXEL = 0.015
 SLIDE = 0.2

@@ -14,14 +14,14 @@ from test_engines import with_looks
 
 from p2gs.app import run as p2gs
 from p2gs.export.asset import Asset, open_note
+from p2gs.export.files.mjcf import write_mjcf
+from p2gs.export.files.simready import file_name
+from p2gs.export.files.urdf import write_urdf
+from p2gs.export.files.usd import write_usd
 from p2gs.export.formats import export_profile
-from p2gs.export.inertia import GRAVITY, enclosed, inertia_of
 from p2gs.export.links import HOLD, LIFT, QUICK
 from p2gs.export.metadata import read_meta
-from p2gs.export.mjcf import write_mjcf
-from p2gs.export.simready import file_name
-from p2gs.export.urdf import write_urdf
-from p2gs.export.usd import write_usd
+from p2gs.export.physics.inertia import GRAVITY, enclosed, inertia_of
 from p2gs.types import UserError
 
 META = {"author": "Jane Doe", "asset_license": "CC-BY-4.0", "category": "StorageFurniture", "qcode": "Q10498396", "year": 2026}
@@ -93,7 +93,7 @@ def test_partnets_other_files_agree_with_it(run, partnet):
 
 def test_sapien_loads_partnets_files(partnet):
     pytest.importorskip("sapien", reason="sapien is not installed (pip install p2gs[validate])")
-    from p2gs.export.engines import load_in_sapien
+    from p2gs.export.checks.engines import load_in_sapien
 
     scene, system, twin = load_in_sapien(partnet / "mobility.urdf")
     assert [j.name for j in twin.active_joints] == ["joint_0", "joint_1"] and len(twin.links) == 4

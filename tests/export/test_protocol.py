@@ -3,13 +3,13 @@
 import pytest
 from toy import toy_scene, toy_twin
 
-from p2gs.export.evaluate import surface_scores
-from p2gs.export.mesh import part_meshes, read_mesh, write_meshes
-from p2gs.export.protocol import SurfaceOptions, largest_clusters, surface_options
 from p2gs.export.run_folder import write_twin
-from p2gs.export.sightings import sight
-from p2gs.export.views import scene_cameras
+from p2gs.gaussians.views import scene_cameras
 from p2gs.ops.mesh import Mesh
+from p2gs.scores.evaluate import surface_scores
+from p2gs.surface.mesh import part_meshes, read_mesh, write_meshes
+from p2gs.surface.protocol import SurfaceOptions, largest_clusters, surface_options
+from p2gs.surface.sightings import sight
 from p2gs.types import UserError
 
 

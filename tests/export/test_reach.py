@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_clearance import block, link, slide, turn
 
-from p2gs.export.clearance import GAP
-from p2gs.export.reach import FULL_TURN, HELD, extend_links
+from p2gs.export.physics.clearance import GAP
+from p2gs.export.physics.reach import FULL_TURN, HELD, extend_links
 
 
 def margin(links):

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from toy import toy_scene, toy_twin
 
-from p2gs.export.mesh import write_meshes
-from p2gs.export.report import chart, is_loss, write_report
-from p2gs.export.report_view import front
+from p2gs.export.pages.report import chart, is_loss, write_report
+from p2gs.export.pages.report_view import front
 from p2gs.export.run_folder import complete_run, write_twin
+from p2gs.surface.mesh import write_meshes
 from p2gs.types import UserError
 
 METRICS = {
@@ -187,7 +187,7 @@ def test_in_a_browser_the_splats_stand_where_the_mesh_stands_and_move_with_it(wa
 def test_a_stage_run_again_draws_one_curve(tmp_path):
     from torch.utils.tensorboard import SummaryWriter
 
-    from p2gs.export.report import read_scalars
+    from p2gs.export.pages.report import read_scalars
 
     for sitting, steps in enumerate((range(0, 10), range(4, 8))):
         writer = SummaryWriter(str(tmp_path), filename_suffix=str(sitting))

@@ -10,8 +10,8 @@ from test_clearance import cabinet
 from test_engines import with_looks, write
 
 from p2gs.export.asset import Asset
-from p2gs.export.clearance import clear_links
-from p2gs.export.usd import write_usd
+from p2gs.export.files.usd import write_usd
+from p2gs.export.physics.clearance import clear_links
 
 PAGES = Path(__file__).parents[2] / "docs" / "simulators"
 

@@ -13,14 +13,14 @@ from solids import intersect
 from toy import toy_scene, toy_twin
 
 from p2gs.export.asset import load_asset, placement
-from p2gs.export.convex import Piece, decompose, hull
+from p2gs.export.files.glb import glb_bytes
 from p2gs.export.formats import EXPORTERS, export_run
-from p2gs.export.glb import glb_bytes
-from p2gs.export.inertia import inertia_of
+from p2gs.export.physics.convex import Piece, decompose, hull
+from p2gs.export.physics.inertia import inertia_of
 from p2gs.export.run_folder import write_twin
-from p2gs.export.simplify import cluster, simplify
-from p2gs.export.tsdf import vertex_normals
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.simplify import cluster, simplify
+from p2gs.surface.tsdf import vertex_normals
 from p2gs.types import Similarity, UserError
 
 SIM = Similarity(2.0, (0.2, 0.1, -0.3))
@@ -31,7 +31,7 @@ REAL = [p for p in os.environ.get("P2GS_RUNS", "").split(os.pathsep) if p]  # re
 
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory):
-    from p2gs.export.mesh import write_meshes
+    from p2gs.surface.mesh import write_meshes
 
     folder = tmp_path_factory.mktemp("cabinet")
     write_twin(toy_twin(SIM), folder, toy_scene(SIM, n=12, size=110), media=False)

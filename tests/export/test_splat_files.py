@@ -14,10 +14,10 @@ from test_engines import with_looks
 from toy import toy_twin
 
 from p2gs.export.asset import Asset, placement
-from p2gs.export.pose import pose
-from p2gs.export.splats_gltf import write_splats
-from p2gs.export.splats_spz import write_spz
-from p2gs.export.usd import write_usd
+from p2gs.export.files.splats_gltf import write_splats
+from p2gs.export.files.splats_spz import write_spz
+from p2gs.export.files.usd import write_usd
+from p2gs.gaussians.pose import pose
 from p2gs.ops.sh import evaluate
 from p2gs.types import ArticulatedObject
 

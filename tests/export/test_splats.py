@@ -8,8 +8,8 @@ import pytest
 import torch
 from toy import toy_twin
 
-from p2gs.export.frame import camera_to_input, object_to_input
-from p2gs.export.splat_ply import read_splat_ply, splat_dtype, write_splat_ply
+from p2gs.gaussians.frame import camera_to_input, object_to_input
+from p2gs.gaussians.splat_ply import read_splat_ply, splat_dtype, write_splat_ply
 from p2gs.types import GaussianTensors, Similarity, UserError
 
 SIM = Similarity(2.5, (0.3, -0.2, 1.0))
@@ -91,7 +91,7 @@ def test_cameras_see_the_same_pixels_in_input_coordinates():
 
 
 def test_pose_moves_each_part_along_its_screw():
-    from p2gs.export.pose import pose
+    from p2gs.gaussians.pose import pose
 
     twin = toy_twin(SIM)
     for t in (-0.5, 0.0, 0.3, 1.0, 1.4):
@@ -112,7 +112,7 @@ def test_pose_moves_each_part_along_its_screw():
 
 
 def test_pose_from_another_canonical_time_gives_the_same_states():
-    from p2gs.export.pose import pose
+    from p2gs.gaussians.pose import pose
 
     start = toy_twin(sh_degree=2)
     middle = toy_twin(sh_degree=2, canonical_time=0.4)
@@ -125,7 +125,7 @@ def test_pose_from_another_canonical_time_gives_the_same_states():
 
 
 def test_pose_takes_one_time_per_part():
-    from p2gs.export.pose import pose
+    from p2gs.gaussians.pose import pose
 
     twin = toy_twin()
     one = pose(twin, [0.0, 0.0, 1.0])
@@ -137,7 +137,7 @@ def test_pose_takes_one_time_per_part():
 
 def test_posed_colours_do_not_change_with_the_part():
     """Seen from a camera that moves along with the door, the door looks the same."""
-    from p2gs.export.pose import part_transform, pose
+    from p2gs.gaussians.pose import part_transform, pose
     from p2gs.ops.sh import evaluate
 
     twin = toy_twin(sh_degree=3)
@@ -150,7 +150,7 @@ def test_posed_colours_do_not_change_with_the_part():
 
 
 def test_twin_json_is_the_contract_and_loads_back(tmp_path):
-    from p2gs.export.twin_json import load_twin, write_twin_json
+    from p2gs.gaussians.twin_json import load_twin, write_twin_json
 
     twin = toy_twin(SIM)
     write_twin_json(twin, tmp_path / "twin.json")

@@ -6,10 +6,10 @@ import pytest
 import torch
 from toy import ring
 
-from p2gs.export.depth_view import camera_rays
-from p2gs.export.paint import draw
-from p2gs.export.surface_depth import planes, surface_depth
+from p2gs.gaussians.paint import draw
 from p2gs.ops import so3
+from p2gs.surface.depth_view import camera_rays
+from p2gs.surface.surface_depth import planes, surface_depth
 from p2gs.types import GaussianTensors
 
 

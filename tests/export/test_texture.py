@@ -8,12 +8,12 @@ from toy import ring, toy_scene, toy_twin
 from traced import boards, seen
 
 from p2gs.export.formats import export_run
-from p2gs.export.mesh import write_meshes
 from p2gs.export.run_folder import write_twin
-from p2gs.export.sightings import Sightings
-from p2gs.export.texture import TILE, Texture, bake, layout, texels
-from p2gs.export.tsdf import fuse
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.mesh import write_meshes
+from p2gs.surface.sightings import Sightings
+from p2gs.surface.texture import TILE, Texture, bake, layout, texels
+from p2gs.surface.tsdf import fuse
 from p2gs.types import UserError
 
 VOXEL = 0.04

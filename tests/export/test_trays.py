@@ -9,10 +9,10 @@ from toy import ring
 from traced import CRATE as BODY
 from traced import boards, seen
 
-from p2gs.export.trays import DEPTH, clear_way, complete_tray, find_front, find_tray, not_the_trays
-from p2gs.export.tsdf import fuse
-from p2gs.export.unseen import eyes_of
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.trays import DEPTH, clear_way, complete_tray, find_front, find_tray, not_the_trays
+from p2gs.surface.tsdf import fuse
+from p2gs.surface.unseen import eyes_of
 
 VOXEL = 0.02
 TRAVEL = 0.35

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from p2gs.export.unique_rows import unique_rows
+from p2gs.ops.unique_rows import unique_rows
 
 
 @pytest.mark.parametrize("n, k, low, high", [(0, 3, 0, 5), (1, 3, 0, 5), (500, 3, -4, 4), (500, 4, 0, 2), (300, 3, -(2**40), 2**40)])

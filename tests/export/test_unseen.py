@@ -9,10 +9,10 @@ import trimesh
 from toy import ring
 from traced import CRATE, boards, seen
 
-from p2gs.export.plinth import plinth_height
-from p2gs.export.tsdf import fuse
-from p2gs.export.unseen import close_unseen_sides, eyes_of, facing, seen_empty
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.plinth import plinth_height
+from p2gs.surface.tsdf import fuse
+from p2gs.surface.unseen import close_unseen_sides, eyes_of, facing, seen_empty
 
 EYE = torch.eye(4, dtype=torch.float64)
 VOXEL = 0.03

@@ -11,12 +11,12 @@ from test_clearance import cabinet
 from test_engines import write
 from test_splat_files import with_splats
 
-from p2gs.export import validators
-from p2gs.export.check import judged_apart
-from p2gs.export.clearance import clear_links
-from p2gs.export.glb import write_glb
-from p2gs.export.splats_gltf import write_splats
-from p2gs.export.validators import VALIDATORS
+from p2gs.export.checks import validators
+from p2gs.export.checks.check import judged_apart
+from p2gs.export.checks.validators import VALIDATORS
+from p2gs.export.files.glb import write_glb
+from p2gs.export.files.splats_gltf import write_splats
+from p2gs.export.physics.clearance import clear_links
 
 
 def test_the_extra_installs_all_of_them():
@@ -63,7 +63,7 @@ def test_gltf_passes_but_for_the_extension_that_the_validator_does_not_know(name
 def test_a_validator_that_crashes_is_a_finding(tmp_path):
     found = judged_apart([sys.executable, "-c", "import os; os.abort()"])
     assert len(found.problems) == 1 and "crashed with signal 6" in found.problems[0]
-    found = judged_apart([sys.executable, "-m", "p2gs.export.validators", "yourdfpy", str(tmp_path)])
+    found = judged_apart([sys.executable, "-m", "p2gs.export.checks.validators", "yourdfpy", str(tmp_path)])
     assert len(found.problems) == 1 and "twin.urdf" in found.problems[0]
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from p2gs.data.furniture import box
-from p2gs.data.raytrace import trace
-from p2gs.data.textures import Texture
-from p2gs.export.depth_view import DepthView, add_normals
+from p2gs.data.generated.furniture import box
+from p2gs.data.generated.raytrace import trace
+from p2gs.data.generated.textures import Texture
+from p2gs.surface.depth_view import DepthView, add_normals
 
 PLAIN = Texture("noise", (0.6, 0.6, 0.6), (0.5, 0.5, 0.5), 0.2, 1)
 

@@ -34,7 +34,7 @@ import json
 from pathlib import Path
 
 from p2gs.data.base import DATASETS, TwoStateData
-from p2gs.data.synthetic import make_object, synthetic_scene
+from p2gs.data.generated.synthetic import make_object, synthetic_scene
 
 @DATASETS.register("own_recipe")
 class Recipe(TwoStateData):
@@ -139,7 +139,7 @@ def test_the_fit_used_all_five(desk, run):
 
 
 def test_the_phase_changed_colours_alone(run):
-    from p2gs.models import handover
+    from p2gs.gaussians import handover
 
     before, after = (handover.load(run / "checkpoints" / f"{n}.pt")[0] for n in ("canonical_fusion", "colours"))
     assert not torch.equal(before.gaussians.sh[:, 0], after.gaussians.sh[:, 0])

@@ -26,8 +26,8 @@ class Target:
 
 def _scene(format: str) -> Target:
     def make(folder: Path) -> None:
-        from p2gs.data.synthetic import make_object
-        from p2gs.data.write import write_scene
+        from p2gs.data.generated.synthetic import make_object
+        from p2gs.data.generated.write import write_scene
 
         write_scene(make_object("lid_box", 1), folder, format, 32, 3, 1, seed=5)
 
@@ -72,7 +72,7 @@ def _make_config(folder: Path) -> None:
 
 
 def _read_config(folder: Path) -> None:
-    from p2gs.config import load_config, save_config
+    from p2gs.config.run import load_config, save_config
 
     config = load_config([str(folder / "user.yaml")])
     save_config(config, folder / "saved.yaml")
@@ -84,10 +84,10 @@ def _read_config(folder: Path) -> None:
 def _make_run(folder: Path) -> None:
     from toy import toy_scene, toy_twin
 
-    from p2gs.export.mesh import Mesh, write_mesh
-    from p2gs.export.splat_ply import write_splat_ply
-    from p2gs.export.twin_json import write_twin_json
-    from p2gs.export.views import scene_cameras, write_cameras
+    from p2gs.gaussians.splat_ply import write_splat_ply
+    from p2gs.gaussians.twin_json import write_twin_json
+    from p2gs.gaussians.views import scene_cameras, write_cameras
+    from p2gs.surface.mesh import Mesh, write_mesh
 
     obj = toy_twin()
     write_splat_ply(folder / "splats" / "canonical.ply", obj.gaussians, obj.part_ids)
@@ -100,11 +100,11 @@ def _make_run(folder: Path) -> None:
 
 
 def _read_run(folder: Path) -> None:
-    from p2gs.export.mesh import read_mesh
-    from p2gs.export.paint import run_rasterizer
-    from p2gs.export.protocol import surface_options
-    from p2gs.export.twin_json import load_twin
-    from p2gs.export.views import read_cameras
+    from p2gs.gaussians.paint import run_rasterizer
+    from p2gs.gaussians.twin_json import load_twin
+    from p2gs.gaussians.views import read_cameras
+    from p2gs.surface.mesh import read_mesh
+    from p2gs.surface.protocol import surface_options
 
     for read, path in ((load_twin, folder), (read_cameras, folder / "cameras.json"), (run_rasterizer, folder), (surface_options, folder)):
         try:
@@ -119,7 +119,7 @@ def _read_run(folder: Path) -> None:
 
 
 def _make_checkpoint(folder: Path) -> None:
-    from p2gs.models import handover
+    from p2gs.gaussians import handover
     from p2gs.types import GaussianTensors
 
     n = 50
@@ -130,8 +130,8 @@ def _make_checkpoint(folder: Path) -> None:
 
 def _read_checkpoint(folder: Path) -> None:
     """Every change is noticed: the checksum is of all bytes."""
-    from p2gs.models import handover
-    from p2gs.models.sealed import Damaged
+    from p2gs.gaussians import handover
+    from p2gs.gaussians.sealed import Damaged
 
     path = folder / "single_state_1.pt"
     try:

@@ -76,7 +76,7 @@ def main() -> None:
     import torch
     from targets import TARGETS
 
-    from p2gs.config import import_builtins
+    from p2gs.config.run import import_builtins
 
     torch.set_num_threads(1)
     import_builtins()

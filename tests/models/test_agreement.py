@@ -4,11 +4,11 @@ import pytest
 import torch
 from tiny import look_at
 
-from p2gs.models.agreement import ShownPixels, ends, kept_and_shown
-from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.screw_polish import PolishConfig
+from p2gs.gaussians.handover import PartMotions, StateGaussians
+from p2gs.motion.agreement import ShownPixels, ends, kept_and_shown
+from p2gs.motion.screw_polish import PolishConfig
 from p2gs.types import GaussianTensors
+from p2gs.visibility.depth_stack import DepthStack
 
 CONFIG = PolishConfig()
 

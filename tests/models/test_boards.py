@@ -7,9 +7,9 @@ import pytest
 import torch
 from test_openings import BOX, DARK, INSIDE, panel, scene
 
-from p2gs.models.boards import FEW, Board, Rays, disagreement, find_boards
-from p2gs.models.openings import OneState, OpeningsConfig
-from p2gs.models.walls import Walls
+from p2gs.surface.boards import FEW, Board, Rays, disagreement, find_boards
+from p2gs.surface.openings import OneState, OpeningsConfig
+from p2gs.surface.walls import Walls
 
 LO, HI = torch.tensor([-0.5, -0.5, -0.5]).double(), torch.tensor([0.5, 0.5, 0.5]).double()
 
@@ -90,7 +90,7 @@ def test_a_board_is_met_within_its_mask_before_the_rays_end():
 
 
 def test_a_backdrop_has_the_shelf_that_only_the_photographs_know(monkeypatch):
-    monkeypatch.setattr("p2gs.models.boards.FEW", 500)  # the pictures are small
+    monkeypatch.setattr("p2gs.surface.boards.FEW", 500)  # the pictures are small
     lid = panel([-0.37, 0.2, -0.27], [0.74, 0, 0], [0, 0, 0.54], DARK)
     shelf = panel([-0.37, -0.27, -0.05], [0.74, 0, 0], [0, 0.57, 0], lambda p: coloured(0.5 * p).float(), step=0.02)
     states, motions, views, stacks = scene(lid, [*(panel(*side, DARK) for side in INSIDE), shelf])

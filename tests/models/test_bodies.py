@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from p2gs.models.bodies import FEWEST, Surfaces, bodies_of, one_part_a_body, pieces
-from p2gs.models.handover import PartMotions, StateGaussians
+from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.ops import se3
+from p2gs.parts.bodies import FEWEST, Surfaces, bodies_of, one_part_a_body, pieces
 from p2gs.types import GaussianTensors
 
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 from tiny import random_gaussians
 
+from p2gs.gaussians.handover import PartMotions
 from p2gs.models import canonical
 from p2gs.models.canonical import CanonicalConfig, beta_weight, blend, carry, farthest_points, fuse, hungarian_pairs, motion_richness
-from p2gs.models.handover import PartMotions
-from p2gs.models.matching import motion_clusters
+from p2gs.motion.matching import motion_clusters
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors, UserError
 

@@ -8,13 +8,13 @@ import torch
 from test_finish import two_states
 from tiny import hinge
 
-from p2gs.export.diagnostics_page import page, write_diagnosis
-from p2gs.models.diagnosis import StageResults, diagnose, plain, reconstruction
+from p2gs.diagnosis.measures import StageResults, diagnose, plain, reconstruction
+from p2gs.diagnosis.page import page, write_diagnosis
+from p2gs.diagnosis.verdict import LIMITS, STAGES, lost_at, verdicts
+from p2gs.gaussians.handover import Articulation, CanonicalGaussians, PartMotions
 from p2gs.models.finish import FinishConfig, finish
-from p2gs.models.handover import Articulation, CanonicalGaussians, PartMotions
-from p2gs.models.joint_confidence import JointEvidence
-from p2gs.models.screw_polish import PolishConfig
-from p2gs.models.verdict import LIMITS, STAGES, lost_at, verdicts
+from p2gs.motion.joint_confidence import JointEvidence
+from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
 from p2gs.types import Similarity
 

@@ -7,6 +7,7 @@ import torch
 from tiny import hinge, photographs, slide, textured_panels
 
 from p2gs.data.views import TrainingViews
+from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.finish import (
     FinishConfig,
     clean_labels,
@@ -18,12 +19,11 @@ from p2gs.models.finish import (
     state_labels,
     surviving_slots,
 )
-from p2gs.models.handover import Articulation, PartMotions, StateGaussians
-from p2gs.models.joint_confidence import state_depth
-from p2gs.models.part_choices import join_twins, simplify, without_part
-from p2gs.models.refine_motions import Judge
-from p2gs.models.screw_polish import MovedGaussians, PolishConfig
+from p2gs.motion.joint_confidence import state_depth
+from p2gs.motion.refine_motions import Judge
+from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3
+from p2gs.parts.part_choices import join_twins, simplify, without_part
 from p2gs.types import GaussianTensors, Similarity
 
 
@@ -89,7 +89,7 @@ def test_one_part_cut_in_two_becomes_one_and_a_true_part_stays(monkeypatch):
     motions = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [cut, cut], [torch.ones(len(cut))] * 2)
     stacks = [state_depth(s, views[s.state], 64) for s in states]
     judge = Judge(SimpleNamespace(search=None), states, views, PolishConfig(levels=[64], level_starts=[0.0]), stacks, 0, "auto")
-    monkeypatch.setattr("p2gs.models.refine_motions.surface_energy", lambda found, T, types: 0.03 * len(types))  # the price of parts alone
+    monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", lambda found, T, types: 0.03 * len(types))  # the price of parts alone
     simple = simplify(judge, motions, 0.04)
     assert len(simple) == 1 and torch.equal(simple.labels[0], labels)
     # the start hides one of the pieces: that they touch shows in the end

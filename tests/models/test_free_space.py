@@ -3,8 +3,8 @@
 import torch
 from tiny import look_at
 
-from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.free_space import explain_by_free_space, hidden_share
+from p2gs.visibility.depth_stack import DepthStack
+from p2gs.visibility.free_space import explain_by_free_space, hidden_share
 
 
 def wall_stack(x: float) -> DepthStack:

@@ -100,7 +100,7 @@ def test_a_state_that_no_view_sees_says_so(scene):
 
 @pytest.mark.parametrize("field", ["means", "log_scales", "sh"])
 def test_a_result_with_nan_is_not_kept(field):
-    from p2gs.models.handover import StateGaussians
+    from p2gs.gaussians.handover import StateGaussians
 
     state = StateGaussians(0, random_gaussians(20))
     check_result("single_state_0", state)

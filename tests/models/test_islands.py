@@ -7,14 +7,14 @@ import torch
 from test_finish import two_states
 from tiny import hinge, look_at, slide
 
-from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.handover import PartMotions
-from p2gs.models.islands import find_islands, pieces, settle_islands, settle_twin_islands
-from p2gs.models.part_pull import facing
-from p2gs.models.refine_motions import Judge, leave_false_minima, survey
-from p2gs.models.screw_polish import PolishConfig
+from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.part_pull import facing
+from p2gs.motion.refine_motions import Judge, leave_false_minima, survey
+from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
+from p2gs.parts.islands import find_islands, pieces, settle_islands, settle_twin_islands
 from p2gs.types import GaussianTensors
+from p2gs.visibility.depth_stack import DepthStack
 
 
 def sheet(corner, n=20, step=0.02):

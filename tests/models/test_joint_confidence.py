@@ -7,9 +7,9 @@ import torch
 from tiny import hinge, photographs, slide, textured_panels
 
 from p2gs.data.views import TrainingViews
-from p2gs.models.handover import StateGaussians
-from p2gs.models.joint_confidence import JointEvidence, landing, measure_joints, measuring_level, nudges, state_depth
-from p2gs.models.screw_polish import MovedGaussians
+from p2gs.gaussians.handover import StateGaussians
+from p2gs.motion.joint_confidence import JointEvidence, landing, measure_joints, measuring_level, nudges, state_depth
+from p2gs.motion.screw_polish import MovedGaussians
 from p2gs.ops import se3, so3
 from p2gs.types import GaussianTensors
 

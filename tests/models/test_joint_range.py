@@ -8,7 +8,7 @@ import pytest
 import torch
 from toy import box, gaussians_of, joint_prismatic, joint_revolute, panel
 
-from p2gs.models.joint_range import FULL_TURN, Obstacles, extend_ranges, moved, passed
+from p2gs.motion.joint_range import FULL_TURN, Obstacles, extend_ranges, moved, passed
 from p2gs.types import ArticulatedObject, GaussianTensors, Part
 
 GREY = (0.5, 0.5, 0.5)
@@ -90,10 +90,10 @@ def test_export_writes_the_extended_limits_and_leaves_the_twin(tmp_path):
     import trimesh
 
     from p2gs.cli import main
-    from p2gs.export.mesh import write_mesh
-    from p2gs.export.splat_ply import write_splat_ply
-    from p2gs.export.twin_json import write_twin_json
+    from p2gs.gaussians.splat_ply import write_splat_ply
+    from p2gs.gaussians.twin_json import write_twin_json
     from p2gs.ops.mesh import Mesh
+    from p2gs.surface.mesh import write_mesh
 
     joint = joint_prismatic((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), 0.2)
     twin = cabinet(joint, box((-0.3, -0.45, -0.2), (0.3, 0.3, 0.2), GREY, skip=("+z",)), [], 0.1)

@@ -8,16 +8,16 @@ import torch
 from tiny import look_at
 
 from p2gs.data.views import TrainingViews
-from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.evidence import gather_evidence
-from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.openings import BASE, DOOR, DRAWER, OpeningsConfig, kinds, open_up, unconfirmed
-from p2gs.models.patches import patches
-from p2gs.models.walls import Backdrop, Walls, over_surface
+from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.ops import se3
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
+from p2gs.parts.patches import patches
 from p2gs.render import rasterize_stored
+from p2gs.surface.openings import BASE, DOOR, DRAWER, OpeningsConfig, kinds, open_up, unconfirmed
+from p2gs.surface.walls import Backdrop, Walls, over_surface
 from p2gs.types import GaussianTensors, View
+from p2gs.visibility.depth_stack import DepthStack
+from p2gs.visibility.evidence import gather_evidence
 
 SIZE = 96
 

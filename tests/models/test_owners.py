@@ -3,12 +3,12 @@
 import torch
 from test_openings import DARK, OUTSIDE, SIZE, outer, panel, photograph
 
-from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.evidence import gather_evidence
-from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.owners import hidden_to_owners, hiders, label_maps, owners
+from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.ops import se3
+from p2gs.parts.owners import hidden_to_owners, hiders, label_maps, owners
 from p2gs.types import GaussianTensors
+from p2gs.visibility.depth_stack import DepthStack
+from p2gs.visibility.evidence import gather_evidence
 
 OUT = 0.25  # how far the drawers come out, along y
 

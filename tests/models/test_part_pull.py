@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from p2gs.models.part_pull import part_pulls, part_pulls_reference
+from p2gs.motion.part_pull import part_pulls, part_pulls_reference
 from p2gs.native import native, why_missing
 from p2gs.ops import so3
 from p2gs.ops.carry import Parts

@@ -9,14 +9,14 @@ import p2gs.losses  # noqa: F401  (registers the built-in losses)
 from p2gs.callbacks.checkpoint import Checkpoint
 from p2gs.callbacks.densify import Densify
 from p2gs.data.views import TrainingViews
+from p2gs.gaussians import handover
+from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.losses.base import LOSSES
-from p2gs.models import handover
 from p2gs.models.articulation import ArticulationConfig, ArticulationPhase
 from p2gs.models.canonical_fusion import CanonicalFusionConfig, CanonicalFusionPhase
-from p2gs.models.handover import PartMotions, StateGaussians
-from p2gs.models.screw_polish import MovedGaussians
 from p2gs.models.sharpen import SharpenConfig, SharpenPhase
 from p2gs.models.single_state import SingleStateConfig, SingleStatePhase, SplatRates, render_gaussians
+from p2gs.motion.screw_polish import MovedGaussians
 from p2gs.ops import se3, so3
 from p2gs.types import GaussianTensors, UserError
 

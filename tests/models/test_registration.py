@@ -9,17 +9,17 @@ from tiny import photographs, textured_panels
 
 from p2gs.data.exposure import brightened, corrected, encoded, linear, median_gain
 from p2gs.data.views import TrainingViews
-from p2gs.export.frame import camera_to_input
-from p2gs.models.discovery.surfels import Surfels
-from p2gs.models.evidence import gather_evidence
-from p2gs.models.handover import Registration, StateGaussians, ViewCorrections
+from p2gs.gaussians.frame import camera_to_input
+from p2gs.gaussians.handover import Registration, StateGaussians, ViewCorrections
 from p2gs.models.registered import as_fitted, correct_scene, dimmed, read_registration, register_state, register_views, write_registration
 from p2gs.models.registration import RegistrationConfig, align_states
-from p2gs.models.surface_fit import fit_surfaces
 from p2gs.models.trial import held_out, trial
+from p2gs.motion.surface_fit import fit_surfaces
 from p2gs.ops import se3
 from p2gs.ops.sh import dc_to_rgb
 from p2gs.types import Similarity, TwoStateScene
+from p2gs.visibility.evidence import gather_evidence
+from p2gs.visibility.surfels import Surfels
 
 BESIDE = se3.exp(torch.tensor([0.003, -0.004, 0.002, 0.012, -0.008, 0.01]).double())  # 0.3 degrees, 0.018 of a box of 2
 

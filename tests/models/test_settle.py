@@ -7,12 +7,12 @@ import torch
 from test_finish import two_states
 from tiny import hinge, slide
 
-from p2gs.models import settle
-from p2gs.models.handover import PartMotions
-from p2gs.models.part_motions import PartMotionsConfig
-from p2gs.models.refine_motions import Judge
-from p2gs.models.screw_polish import PolishConfig
+from p2gs.gaussians.handover import PartMotions
+from p2gs.models.part_discovery import PartMotionsConfig
+from p2gs.motion.refine_motions import Judge
+from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
+from p2gs.parts import settle
 
 COARSE = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0)
 
@@ -80,7 +80,7 @@ def second_owns_the_panel(monkeypatch):
 def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
     """However much the surfaces gain by it."""
     states, labels, views, margins, off = second_owns_the_panel(monkeypatch)
-    monkeypatch.setattr("p2gs.models.refine_motions.surface_energy", lambda found, T, types: -10.0 * len(types))
+    monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", lambda found, T, types: -10.0 * len(types))
 
     def added(start, further):
         monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: [(further, "prismatic")] if part is None else [])
@@ -96,7 +96,7 @@ def test_two_bodies_with_amounts_of_their_own_are_taken_where_the_energy_falls(m
     monkeypatch.setattr(settle, "in_two", lambda found, T, types: [(0, torch.stack([T[0], slide()]), [*types, "prismatic"])])
     motions = PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], margins)
     for price, parts in ((0.01, 2), (9.0, 1)):
-        monkeypatch.setattr("p2gs.models.refine_motions.surface_energy", lambda found, T, types, price=price: price * len(types))
+        monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", lambda found, T, types, price=price: price * len(types))
         found, log = settle.reconsider(judge_of(states, views), motions, 2, PartMotionsConfig())
         assert len(found) == parts and log[0]["change"] == "parted"
 

@@ -5,8 +5,8 @@ import torch
 from tiny import random_gaussians
 
 from p2gs.callbacks.densify import Densify
+from p2gs.gaussians.splats import Splats, gather
 from p2gs.models.densify import densify, reset_opacity
-from p2gs.models.splats import Splats, gather
 from p2gs.types import UserError
 
 

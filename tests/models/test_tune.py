@@ -8,8 +8,8 @@ from tiny import hinge
 
 from p2gs.losses.base import LOSSES, Loss
 from p2gs.models.canonical import carry, with_static
-from p2gs.models.screw_polish import photometric_cost
 from p2gs.models.tune import TuneConfig, tune
+from p2gs.motion.screw_polish import photometric_cost
 from p2gs.types import GaussianTensors
 
 LEVEL = TuneConfig(steps=60, levels=[64])

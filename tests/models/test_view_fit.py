@@ -9,11 +9,11 @@ from tiny import photographs, textured_panels
 
 from p2gs.data.exposure import corrected
 from p2gs.data.views import TrainingViews
-from p2gs.models.handover import StateGaussians, ViewCorrections, load, save
+from p2gs.gaussians.handover import StateGaussians, ViewCorrections, load, save
+from p2gs.gaussians.splats import Splats
 from p2gs.models.phase import exponential
 from p2gs.models.registered import correct_views
 from p2gs.models.single_state import SingleStateConfig, SingleStatePhase, render_gaussians
-from p2gs.models.splats import Splats
 from p2gs.models.view_fit import ViewErrors, ViewFitConfig, halves, measure_gains, try_cameras, try_gains
 from p2gs.ops import se3
 from p2gs.ops.ssim import l1_ssim

@@ -4,10 +4,10 @@ import pytest
 import torch
 from tiny import look_at
 
-from p2gs.models.visibility import footprint, visible_share
 from p2gs.render import rasterize
 from p2gs.render.base import PIXELS
 from p2gs.types import GaussianTensors
+from p2gs.visibility.share import footprint, visible_share
 
 
 def gaussians(means, scales, opacity):

@@ -3,7 +3,7 @@
 import torch
 
 from p2gs.data.base import TwoStateData, Visit
-from p2gs.models.screw_polish import MovedGaussians
+from p2gs.motion.screw_polish import MovedGaussians
 from p2gs.ops import se3
 from p2gs.render import rasterize
 from p2gs.types import Camera, GaussianTensors, TwoStateScene, View

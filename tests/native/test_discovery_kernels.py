@@ -5,16 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 
-from p2gs.models.discovery.config import DiscoveryConfig
-from p2gs.models.discovery.evidence import DepthStack
-from p2gs.models.discovery.fields import Landing, Scale
-from p2gs.models.discovery.labels import Graph, smooth_labels, smooth_labels_reference
-from p2gs.models.discovery.pool import Pool, joint_sums, joint_sums_reference
-from p2gs.models.discovery.problem import Problem
-from p2gs.models.discovery.refine import normal_equations, normal_equations_reference
-from p2gs.models.discovery.rigid import Motions
-from p2gs.models.discovery.surfels import Surfels
+from p2gs.motion.discovery.config import DiscoveryConfig
+from p2gs.motion.discovery.fields import Landing, Scale
+from p2gs.motion.discovery.labels import Graph, smooth_labels, smooth_labels_reference
+from p2gs.motion.discovery.pool import Pool, joint_sums, joint_sums_reference
+from p2gs.motion.discovery.problem import Problem
+from p2gs.motion.discovery.refine import normal_equations, normal_equations_reference
+from p2gs.motion.discovery.rigid import Motions
 from p2gs.types import Camera
+from p2gs.visibility.depth_stack import DepthStack
+from p2gs.visibility.surfels import Surfels
 
 
 class NoViews(DepthStack):
@@ -186,7 +186,7 @@ def test_normal_equations_against_torch(isa, threads, width):
 
 def test_torch_takes_over_where_there_are_no_kernels(monkeypatch):
     problem, motions, index = make_problem(), make_motions(5), torch.arange(300)
-    monkeypatch.setattr("p2gs.models.discovery.fields.native", None)
+    monkeypatch.setattr("p2gs.motion.discovery.fields.native", None)
     for state in (0, 1):
         for a, b in zip(problem.cost(motions, state, index), twin(problem, motions, state, index), strict=True):
             assert torch.equal(a, b)
@@ -335,5 +335,5 @@ def test_a_sets_evidence_against_torch(monkeypatch):
     pool.pays, pool.loose = [torch.rand_like(p) for p in pool.pays], [torch.rand_like(p) > 0.5 for p in pool.pays]
     sets = [[4], [3, 7, 20], list(range(12))]
     got = [pool.total(s) for s in sets]
-    monkeypatch.setattr("p2gs.models.discovery.pool.native", None)
+    monkeypatch.setattr("p2gs.motion.discovery.pool.native", None)
     assert got == pytest.approx([pool.total(s) for s in sets], rel=1e-5) and min(got) > 0.1

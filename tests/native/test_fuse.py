@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from p2gs.export.depth_view import DepthView, add_normals, pixel_matrix
-from p2gs.export.integrate import integrate, integrate_reference
 from p2gs.ops import se3
+from p2gs.surface.depth_view import DepthView, add_normals, pixel_matrix
+from p2gs.surface.integrate import integrate, integrate_reference
 from p2gs.types import Camera
 
 TRUNC, BEHIND = 0.12, 0.06

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from p2gs.models import handover
+from p2gs.gaussians import handover
 
 REPO = Path(__file__).parents[2]
 

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from p2gs.callbacks.base import Callback, register_callback
-from p2gs.config import load_config
-from p2gs.models import handover
-from p2gs.side_stage import SideStage, can_run_beside
+from p2gs.config.run import load_config
+from p2gs.gaussians import handover
+from p2gs.runtime.side_stage import SideStage, can_run_beside
 from p2gs.types import UserError
 
 REPO = Path(__file__).parents[2]

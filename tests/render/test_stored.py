@@ -4,8 +4,8 @@ import pytest
 import torch
 from worlds import backward, relative_error, world
 
+from p2gs.gaussians.splats import Splats
 from p2gs.models.single_state import render_gaussians
-from p2gs.models.splats import Splats
 from p2gs.render import RASTERIZERS, rasterize_stored
 from p2gs.types import Camera, GaussianTensors
 

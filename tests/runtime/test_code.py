@@ -89,10 +89,10 @@ def test_the_whole_package_is_read_in_half_a_second():
     began = time.process_time()
     assert CodeReader().code_of(modules) == code
     assert time.process_time() - began < 0.5
-    assert "p2gs.export.urdf" in code and "native kernels" in code and "p2gs.cli" not in code
+    assert "p2gs.export.files.urdf" in code and "native kernels" in code and "p2gs.cli" not in code
 
 
 def test_a_single_state_does_not_hang_on_discovery():
     """An edit of discovery must not make both reconstructions again."""
     code = CodeReader().code_of(["p2gs.models.single_state"])
-    assert "p2gs.models.splats" in code and not [m for m in code if "discovery" in m or m.startswith("p2gs.export")]
+    assert "p2gs.gaussians.splats" in code and not [m for m in code if "discovery" in m or m.startswith("p2gs.export")]

@@ -6,11 +6,11 @@ from functools import partial
 import cv2
 import pytest
 
-from p2gs.config import load_config
+from p2gs.config.run import load_config
 from p2gs.data.base import TwoStateData
-from p2gs.pipeline import Pipeline
 from p2gs.runtime.code import CodeReader
 from p2gs.runtime.keys import changes, flat, scene_files
+from p2gs.runtime.pipeline import Pipeline
 
 TINY = """
 include: [preset/smoke.yaml]
@@ -22,7 +22,7 @@ callbacks: {{checkpoint: null, scalars: null, previews: null, evaluation: null, 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    from p2gs.data.generate import synthesize
+    from p2gs.data.generated.generate import synthesize
 
     return synthesize(tmp_path_factory.mktemp("keys") / "scene", 0, "demo", 24, 3, 1)
 

@@ -89,8 +89,8 @@ def test_names_of_states_are_taken():
 
 
 def test_the_built_in_phases_fit_together():
-    from p2gs.config import import_builtins
-    from p2gs.run_schema import STAGES
+    from p2gs.config.keys import STAGES
+    from p2gs.config.run import import_builtins
 
     import_builtins()
     order = stage_order(run(*STAGES))

@@ -1,0 +1,214 @@
+"""The stage between reconstruction and learning: find parts and motions, let the images decide, refine the screws.
+
+Not a training phase of the paper: its ancestors need hand-made part centres or ground truth here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from p2gs.data.views import TrainingViews
+from p2gs.gaussians.handover import PartMotions, StateGaussians
+from p2gs.models.phase import PHASES
+from p2gs.motion.discovery import Discovery, DiscoveryConfig, StateEvidence, discover, relabel
+from p2gs.motion.refine_motions import Judge, leave_false_minima
+from p2gs.motion.screw_polish import PolishConfig
+from p2gs.parts.bodies import Surfaces, one_part_a_body
+from p2gs.parts.part_choices import join_twins, settle_types, simplify
+from p2gs.parts.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
+from p2gs.types import TwoStateScene, UserError
+from p2gs.visibility.evidence import gather_evidence
+
+
+@dataclass
+class PartMotionsConfig:
+    """Options of part discovery.
+
+    evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
+    candidates: how many complete explanations, and later changes of one kind, are compared by re-rendering; of more explanations those that
+    look best at a glance, after ``look_steps`` of refinement at the smallest size.
+    coarse: photometric refinement right after discovery.
+    compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
+    freedom_penalty: relative image loss by which a turn must win against a slide.
+    same_motion: two touching parts whose motions carry them this near to each other (internal units) are tried as one.
+    survey: shifts within its own surface tried for each part (internal units; [] = none).
+    part_penalty: share of the image loss that each part must save, or goes, and that one which is added or halved must save when parts are
+    reconsidered. On ten objects junk saved at most 1.6 %, true parts 6 % and more, the second of two stacked doors 3 %.
+    islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
+    (0 = off).  rounds: how often labels, types and motions are settled anew.
+    reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched again amid the others,
+    refined, and taken where the energy falls.
+    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
+    """
+
+    evidence_size: int = 200
+    min_opacity: float = 0.5
+    candidates: int = 3
+    look_steps: int = 40
+    compare_types_below: float = 45.0
+    freedom_penalty: float = 0.002
+    same_motion: float = 0.04
+    part_penalty: float = 0.02
+    survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
+    islands: float = 0.25
+    rounds: int = 2
+    reconsider: bool = True
+    min_confidence: float = 0.02
+    search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
+    coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
+
+
+@PHASES.register("discovery")
+class DiscoveryStage:
+    """A stage without training: no losses, no callbacks."""
+
+    Config = PartMotionsConfig
+    trained = False
+
+
+def find_part_motions(
+    states: list[StateGaussians],
+    scene: TwoStateScene,
+    views: dict[int, TrainingViews],
+    num_parts,
+    config: PartMotionsConfig,
+    *,
+    seed: int,
+    backend: str = "auto",
+    device: torch.device | str = "cpu",
+    report=None,
+) -> PartMotions:
+    """Parts, motions and labels of every Gaussian of both states, from the reconstructions and the images alone."""
+    say = report or (lambda text: None)
+    options = {"seed": seed, "backend": backend, "device": device}
+    say("rendering depth of both states")
+    evidence = _evidence(states, scene, config, backend, device)
+    say("looking for parts")
+    found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
+    judge = Judge(found, states, views, config.coarse, found.problem.stacks, further=config.part_penalty, **options)
+    explanations, looks = _looked_at(judge, _explanations(found), config, say)
+    motions, compared = _compared(judge, explanations, config, say)
+    limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
+    motions, improved = _improved(judge, motions, limit, config, say)
+    say("settling labels and motions")
+    motions, rounds = settle_labels(judge, motions, config)
+    motions, joined = join_twins(states, motions, found.problem.scale.tp)
+    if joined:
+        motions = judge.refine(motions)
+    motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
+    for part in unfounded:
+        say(f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})")
+    motions.diagnostics = {
+        "first_looks": looks,
+        "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],  # of the Gaussians above min_opacity
+        "min_opacity": config.min_opacity,
+        **compared,
+        **improved,
+        "rounds": rounds,
+        "joined": joined,
+        "unfounded": unfounded,
+        **_plain(found.diagnostics),
+    }
+    return motions
+
+
+def _evidence(states: list[StateGaussians], scene: TwoStateScene, config: PartMotionsConfig, backend: str, device) -> list[StateEvidence]:
+    """Surface points and rendered depth of both states. Raises UserError where there are none."""
+    out = []
+    for s in states:
+        seen = scene.select(state=s.state, split="train")
+        out.append(gather_evidence(s.gaussians, seen, config.evidence_size, config.min_opacity, backend, device))
+        if len(out[-1].points) < 10 or not any(bool((d > 0).any()) for d in out[-1].depths):
+            name = ("start", "end")[s.state]
+            raise UserError(f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)")
+    return out
+
+
+def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[list, list[float]]:
+    """The ``candidates`` explanations that look best after a few steps at the smallest size, and the energies of all then."""
+    if len(explanations) <= config.candidates:
+        return explanations, []
+    say(f"a quick look at {len(explanations)} explanations")
+    quick = judge.at_a_glance(config.look_steps)
+    looks = [quick(quick.refine(_label_states(e, judge.states)))[0] for e in explanations]
+    order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
+    return [explanations[i] for i in order], looks
+
+
+def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
+    """The explanation of lowest energy, refined and without parts that it is better without; which it was, and what each came to."""
+    refined, tried = [], []
+    for number, explanation in enumerate(explanations):
+        motions = _label_states(explanation, judge.states)
+        if len(explanations) > 1:
+            say(f"re-rendering explanation {number + 1} of {len(explanations)}")
+        reductions: list[dict] = []
+        motions = simplify(judge, judge.improved(motions)[2], config.same_motion, reductions)
+        rank, cost = judge(motions)
+        tried.append({"types": motions.types, "cost": cost, "rank": rank, "reductions": reductions})
+        refined.append((rank, number, motions))
+    _, number, motions = min(refined, key=lambda t: t[:2])
+    return motions, {"explanation": number, "explanations": tried}
+
+
+def _improved(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
+    """Types settled, bodies told apart, false minima left, each part reconsidered; what was done."""
+    motions = settle_types(judge, motions, config.compare_types_below, config.freedom_penalty)
+    motions, bodies = one_part_a_body(judge.states, motions, labelled_surfaces(judge.found, motions.transforms, motions.types), limit)
+    if bodies:
+        motions = judge.improved(motions)[2]
+    changed: list[dict] = [{"change": "one part a body", **b} for b in bodies]
+    motions, shifted = leave_false_minima(judge, motions, config.survey)
+    if config.reconsider:
+        say("reconsidering each part")
+        motions, reconsidered = reconsider(judge, motions, limit, config)
+        changed += reconsidered
+        motions = simplify(judge, motions, config.same_motion, changed)
+    return motions, {"shifted": shifted, "reconsidered": changed}
+
+
+def labelled_surfaces(found: Discovery, transforms: Tensor, types: list[str]) -> Surfaces:
+    """Both states' surfels, each with the part that it chooses amid motions ``transforms`` [K, 4, 4] of ``types``."""
+    explanation, problem = relabel(found, transforms, types), found.problem
+    points, labels = [s.points for s in problem.surfels], [p.argmax(1) for p in explanation.probability]
+    return Surfaces(points, labels, problem.scale.spacing, problem.stacks, problem.scale.tau)
+
+
+def _explanations(found) -> list:
+    """The chosen explanation first, then the alternatives that differ from it."""
+
+    def signature(e):
+        return [(m.type, torch.as_tensor(m.transform).double().round(decimals=4).tolist()) for m in e.motions]
+
+    return [found, *[c for c in found.candidates if signature(c) != signature(found)]]
+
+
+def _label_states(explanation, states: list[StateGaussians]) -> PartMotions:
+    """An explanation's motions with the label of every Gaussian."""
+    labels, margin = label_gaussians(explanation, states)
+    types = [m.type for m in explanation.motions]
+    transforms = (
+        torch.stack([torch.as_tensor(m.transform, dtype=torch.float64) for m in explanation.motions])
+        if types
+        else torch.zeros(0, 4, 4).double()
+    )
+    confidence = torch.tensor([float(m.confidence) for m in explanation.motions])
+    return PartMotions(types, transforms, confidence, labels, margin)
+
+
+def _plain(value):
+    """Only what a checkpoint loads without code: numbers, text, lists, dicts."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, Tensor):
+        return value.detach().cpu()
+    if isinstance(value, (bool, int, float, str)) or value is None:
+        return value
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    return str(value)

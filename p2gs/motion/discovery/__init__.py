@@ -1,0 +1,11 @@
+"""Part and joint discovery from two reconstructed states: free-space evidence, exhaustive rigid hypotheses, joint selection, labels."""
+
+from p2gs.motion.discovery.config import DiscoveryConfig
+from p2gs.motion.discovery.pipeline import discover, in_two, instead_of, places_changed, relabel, surface_energy
+from p2gs.motion.discovery.result import Candidate, Discovery, FoundMotion
+from p2gs.visibility.depth_stack import StateEvidence
+
+__all__ = [
+    "Candidate", "Discovery", "DiscoveryConfig", "FoundMotion", "StateEvidence", "discover", "in_two", "instead_of", "places_changed",
+    "relabel", "surface_energy",
+]  # fmt: skip

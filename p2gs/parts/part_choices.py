@@ -1,0 +1,130 @@
+"""Which parts there are and how each may move: merge, drop, slide or turn, as the images decide."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.refine_motions import Judge
+from p2gs.ops import se3, so3
+from p2gs.ops.knn import knn
+
+
+def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None) -> PartMotions:
+    """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the energy does not rise;
+    drop a part, too, that saves less of the image loss than a further one must (``judge.further``).
+
+    log: told of each part that goes: what was done, its type, image loss with and without it, what the energy gains.
+    """
+    lowest, cost = judge(motions)
+    tried: set[tuple] = set()
+    while len(motions):
+        for change, reduced in _reductions(judge.states, motions, same_motion):
+            if change in tried:
+                continue
+            tried.add(change)
+            value, lower = judge(reduced)
+            if value <= lowest or (change[0] == "drop" and cost > lower * (1 - judge.further)):
+                break
+        else:
+            return motions
+        if log is not None:
+            gone = {"change": change[0], "type": motions.types[change[1]], "cost_with": cost, "cost_without": lower}
+            log.append({**gone, "energy": value - lowest})
+        motions, lowest, cost = reduced, value, lower
+        tried.clear()
+    return motions
+
+
+def join_twins(states, motions: PartMotions, reach: float) -> tuple[PartMotions, list[dict]]:
+    """One part for every two that touch and whose motions carry the smaller one's points to within ``reach`` (internal units) of each other:
+    nothing tells them from one body.  Returns the motions and the types of those that went, with the parts that they joined."""
+    log: list[dict] = []
+    while (pair := next((c for c in _reductions(states, motions, reach) if c[0][0] == "merge"), None)) is not None:
+        (_, small, large), reduced = pair
+        log.append({"type": motions.types[small], "into": large})
+        motions = reduced
+    return motions, log
+
+
+def _reductions(states, motions: PartMotions, same_motion: float):
+    """Explanations with one part less: (what changed, motions). Merging comes first, small parts go before large ones."""
+    solid = [torch.sigmoid(s.gaussians.opacity_logits) > 0.5 for s in states]
+    points = [
+        [s.gaussians.means[of & (lab == k + 1)].double() for s, of, lab in zip(states, solid, motions.labels, strict=True)]
+        for k in range(len(motions))
+    ]
+    order = sorted(range(len(motions)), key=lambda k: len(points[k][0]))
+    for i, small in enumerate(order):
+        for large in reversed(order[i + 1 :]):
+            # each state by itself: what one hides of a part (the inside of a shut drawer) the other shows
+            for a, b, back in ((points[small][0], points[large][0], False), (points[small][1], points[large][1], True)):
+                if min(len(a), len(b)) < 5:
+                    continue
+                ways = [se3.inverse(motions.transforms[k]) if back else motions.transforms[k] for k in (small, large)]
+                gap = se3.apply(ways[0], a) - se3.apply(ways[1], a)
+                if float(gap.norm(dim=1).mean()) < same_motion and _touch(a, b):
+                    yield ("merge", small, large), without_part(motions, small, large + 1)
+                    break
+    for small in order:
+        yield ("drop", small), without_part(motions, small, 0)
+
+
+def _touch(a: Tensor, b: Tensor) -> bool:
+    """Whether two point sets [N, 3], [M, 3] come as near to each other somewhere as the smaller one's points are to theirs."""
+    if len(a) > len(b):
+        a, b = b, a
+    spacing = knn(a, None, 1, True)[0].median()
+    return float(knn(b, a, 1, False)[0].quantile(0.02)) < 3 * float(spacing)
+
+
+def without_part(motions: PartMotions, index: int, into: int) -> PartMotions:
+    """The same motions without entry ``index``; its Gaussians get label ``into`` (numbered as before: 0 static, k + 1 for entry k)."""
+    keep = [k for k in range(len(motions)) if k != index]
+    renumber = torch.zeros(len(motions) + 1, dtype=torch.int64)
+    for new, old in enumerate(keep):
+        renumber[old + 1] = new + 1
+    renumber[index + 1] = renumber[into]
+    labels = [renumber[old] for old in motions.labels]
+    return PartMotions(
+        [motions.types[k] for k in keep], motions.transforms[keep], motions.confidence[keep], labels, motions.margin, motions.diagnostics
+    )
+
+
+def settle_types(judge: Judge, motions: PartMotions, below: float, penalty: float) -> PartMotions:
+    """Fit both joint types where a part turns by less than ``below`` (degrees), keep the one the images prefer; then refine with the types held.
+
+    penalty: share of the image loss by which a turn must win: it has two freedoms more.
+    """
+    best = None
+    for k in range(len(motions)):
+        angle = math.degrees(float(so3.rotation_angle(motions.transforms[k, :3, :3])))
+        if motions.types[k] != "revolute" or angle >= below:
+            continue
+        best = judge.cost(motions) if best is None else best
+        other = judge.refine(min(_as_slides(judge.states, motions, k), key=judge.cost))
+        found = judge.cost(other)
+        if found <= best * (1 + penalty):
+            motions, best = other, found
+    return motions
+
+
+def _as_slides(states, motions: PartMotions, k: int) -> list[PartMotions]:
+    """The same with part k a slide that carries its middle where it goes, or as far as that is along the slide of another part."""
+    own = states[0].gaussians.means[motions.labels[0] == k + 1].double()
+    centre = own.mean(0) if len(own) else torch.zeros(3).double()
+    way = se3.apply(motions.transforms[k], centre[None])[0] - centre
+    ways = [way]
+    for i, kind in enumerate(motions.types):
+        if kind == "prismatic":
+            along = torch.nn.functional.normalize(motions.transforms[i, :3, 3], dim=0)
+            ways += [along * (way @ along), along * way.norm() * torch.sign(way @ along)]
+    out = []
+    for w in ways:
+        T = torch.eye(4).double()
+        T[:3, 3] = w
+        out.append(motions.with_motion(k, "prismatic", T))
+    return out

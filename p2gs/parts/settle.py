@@ -1,0 +1,129 @@
+"""With refined motions: what each part's motion should be amid the others, and which Gaussians belong to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from p2gs.gaussians.handover import PartMotions, StateGaussians
+from p2gs.motion.discovery import Candidate, Discovery, in_two, instead_of, places_changed, relabel
+from p2gs.motion.refine_motions import Judge
+from p2gs.ops.sh import dc_to_rgb
+from p2gs.parts.islands import settle_islands
+from p2gs.parts.part_choices import settle_types, without_part
+
+if TYPE_CHECKING:
+    from p2gs.models.part_discovery import PartMotionsConfig
+
+
+def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
+    """Label and margin [N] of every Gaussian (also the faint ones) of both states."""
+    labels, margin = [], []
+    for state, s in enumerate(states):
+        lab, mar = explanation.label_points(s.gaussians.means, dc_to_rgb(s.gaussians.sh[:, 0]).clamp(0, 1), state)
+        labels.append(torch.as_tensor(lab, dtype=torch.int64))
+        margin.append(torch.as_tensor(mar, dtype=torch.float32))
+    return labels, margin
+
+
+def reconsider(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:
+    """Exchange motions for others that explain what the refined rest leaves over, those of two like parts for such as change their ends, add
+    one, or make one part two, while the energy falls.
+
+    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such as take each for the
+    other at the end (``places_changed``), and for each part the two amounts about one axis that explain most (``in_two``). Under each proposal
+    every surfel chooses its part anew, and with the ``candidates`` of each kind that surfaces like best the states are re-rendered. The best
+    of each kind is refined, and the energy must fall; with a further part the image loss must as well (``judge.further``): what surfaces
+    alone gain is junk.
+    Returns the motions and what was tried.
+    """
+    found, states, log = judge.found, judge.states, []
+    lowest, cost = judge(motions)
+    for _ in range(limit if len(motions) else 0):
+        tries = {"exchanged": [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]}
+        tries["crossed"] = _proposed(found, states, motions, places_changed(found, motions.transforms, motions.types))
+        if len(motions) < limit:
+            tries["added"] = [(len(motions), m) for m in _with_part(found, states, motions, None)]
+            tries["parted"] = _proposed(found, states, motions, in_two(found, motions.transforms, motions.types))
+        best = None
+        for change, proposed in tries.items():
+            if not proposed:
+                continue
+            proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[: config.candidates]
+            part, tried = min(proposed, key=lambda p: judge(p[1])[0])
+            value, reached, refined = judge.improved(tried)
+            log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
+            log[-1] |= {"proposed": judge(tried)[0] - lowest, "energy": value - lowest}
+            junk = len(refined) > len(motions) and reached > cost * (1 - judge.further)
+            if value < (lowest if best is None else best[0]) and not junk:
+                best = (value, reached, refined)
+        if best is None:
+            break
+        lowest, cost, motions = best
+    return motions, log
+
+
+def _with_part(found: Discovery, states, motions: PartMotions, part: int | None) -> list[PartMotions]:
+    """The motions with another one for ``part`` (None: with one more), labels chosen anew."""
+    k, out = len(motions) if part is None else part, []
+    for transform, kind in instead_of(found, motions.transforms, motions.types, part):
+        out.append(_relabelled(found, states, motions.with_motion(k, kind, transform)))
+    return out
+
+
+def _proposed(found: Discovery, states, motions: PartMotions, proposals: list[tuple]) -> list[tuple[int, PartMotions]]:
+    """Of each (part, transforms, types) the part and the motions, labels chosen anew."""
+    out = []
+    for k, transforms, types in proposals:
+        tried = replace(motions, types=types, transforms=transforms, confidence=torch.zeros(len(types)))
+        out.append((k, _relabelled(found, states, tried)))
+    return out
+
+
+def _relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:
+    """The same motions with labels chosen anew, and discovery's confidence in them under these."""
+    explanation = relabel(found, motions.transforms, motions.types)
+    labels, margin = label_gaussians(explanation, states)
+    return replace(motions, labels=labels, margin=margin, confidence=torch.tensor([m.confidence for m in explanation.motions]))
+
+
+def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:
+    """With the refined motions every Gaussian chooses its part anew, islands are settled, motions refined again and types settled.
+
+    For up to ``rounds`` rounds, while the energy falls. Returns the motions and what each round measured.
+    """
+    found, states, rounds = judge.found, judge.states, []
+    for number in range(config.rounds if len(motions) else 0):
+        lowest, cost = judge(motions)
+        best = None
+        # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from here on
+        for name in ("kept", "anew"):
+            tried = _relabelled(found, states, motions) if name == "anew" else motions
+            labels, count = settle_islands([s.gaussians for s in states], tried.labels, tried.transforms, config.islands)
+            if all(map(torch.equal, labels, motions.labels)):
+                continue
+            value, reached, tried = judge.improved(replace(tried, labels=labels))
+            rounds.append({"round": number, "labels": name, "islands": count, "before": cost, "after": reached, "energy": value - lowest})
+            if best is None or value < best[0]:
+                best = (value, tried)
+        if best is None or best[0] >= lowest:
+            break
+        motions = settle_types(judge, best[1], config.compare_types_below, config.freedom_penalty)
+    return motions, rounds
+
+
+def drop_unfounded(judge: Judge, motions: PartMotions, least: float) -> tuple[PartMotions, list[dict]]:
+    """Without the parts whose confidence is below ``least``, the least first; labels are chosen anew and motions refined.
+
+    A part that only one state shows has a motion that nothing was observed of: it may explain the other state's photographs a little better
+    (by hiding junk), and is no finding. Returns the motions, and type and confidence of each that went.
+    """
+    gone: list[dict] = []
+    while len(motions) and float(motions.confidence.min()) < least:
+        k = int(motions.confidence.argmin())
+        gone.append({"type": motions.types[k], "confidence": float(motions.confidence[k])})
+        motions = _relabelled(judge.found, judge.states, without_part(motions, k, 0))
+    return (judge.refine(motions) if gone else motions), gone

@@ -1,0 +1,128 @@
+"""Scores of a captured scene's run in true metres: ``p2gs test RUN --truth DIR``.
+
+The capture has a frame and a unit of its own. Its registered start cameras, matched to the true ones through ``capture.json``, give the
+similarity to the true world; what is left of the end cameras after it is the states' misalignment.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Optional
+
+import numpy as np
+import torch
+
+from p2gs.data.capture.model import similarity
+from p2gs.data.ground_truth import parse_joint
+from p2gs.gaussians.twin_json import load_twin
+from p2gs.metrics.modules import JointError
+from p2gs.models.registered import REGISTRATION, read_registration
+from p2gs.scores.evaluate import scene_folder
+from p2gs.types import Joint, UserError
+
+STATES = ("start", "end")
+
+
+def _json(path: Path):
+    if not path.is_file():
+        raise UserError(f"{path}: is missing, so the capture cannot be scored")
+    return json.loads(path.read_text())
+
+
+def camera_pairs(scene: Path, truth: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """State -> (own, true) camera-to-world matrices [N, 4, 4] of the photographs that both know. OpenGL axes."""
+    true = _json(truth / "cameras.json")["c2w"]
+    source = {i["file"]: i for i in _json(scene / "capture.json")["images"] if i["file"]}
+    out = {}
+    for state in STATES:
+        own, other = [], []
+        for frame in _json(scene / f"transforms_train_{state}.json")["frames"]:
+            key = f"{state}/{Path(source[frame['file_path']]['source']).stem}"
+            if key in true:
+                own.append(frame["transform_matrix"]), other.append(true[key])
+        if len(own) < 3:
+            raise UserError(
+                f"{truth / 'cameras.json'}: knows {len(own)} photographs of state '{state}', expected at least 3"
+            )
+        out[state] = (np.array(own, float), np.array(other, float))
+    return out
+
+
+def rigid_between(own: np.ndarray, other: np.ndarray, with_scale: bool) -> np.ndarray:
+    """[4, 4] least squares own -> other of camera centres."""
+    return similarity(own[:, :3, 3], other[:, :3, 3], with_scale=with_scale)
+
+
+def moved_joint(joint: Joint, T: np.ndarray) -> Joint:
+    """A joint after the similarity T."""
+    scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
+    R = torch.tensor(T[:3, :3] / scale)
+    origin = scale * (R @ joint.origin.double()) + torch.tensor(T[:3, 3])
+    unit = 1.0 if joint.type == "revolute" else scale
+    limits = (joint.limits[0] * unit, joint.limits[1] * unit)
+    return Joint(joint.type, R @ joint.axis.double(), origin, joint.motion * unit, limits, joint.transform)
+
+
+def base_points(truth: Path, count: int = 2000) -> Optional[np.ndarray]:
+    """[n, 3] points of the true base's surface, or None where its mesh is not there."""
+    import trimesh
+
+    for name in ("start_static_rotate.ply", "start_rotate.ply"):
+        path = truth / "start" / name
+        if path.is_file():
+            mesh = trimesh.load(path, process=False, force="mesh")
+            return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
+    return None
+
+
+def evaluate_capture(run: Path | str, truth: Path | str, root: Optional[Path | str] = None) -> dict:
+    """Joints in metres and degrees, scale, the states' misalignment; also written to RUN/capture_metrics.json.
+
+    truth: folder with cameras.json, trans.json and meshes. Raises UserError, naming the file, where one is missing.
+    """
+    run, truth = Path(run), Path(truth)
+    truth = truth / "gt" if (truth / "gt").is_dir() else truth
+    scene = Path(root) if root is not None else scene_folder(run)
+    pairs = camera_pairs(scene, truth)
+    T = rigid_between(*pairs["start"], with_scale=True)
+    end_own, end_true = pairs["end"]
+    end_own = read_registration(run / REGISTRATION)[0].transform.numpy() @ end_own  # where the run has put them
+    placed = end_own.copy()
+    placed[:, :3, 3] = end_own[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
+    D = rigid_between(placed, end_true, with_scale=False)
+    points = base_points(truth)
+    off = None if points is None else np.linalg.norm(points @ D[:3, :3].T + D[:3, 3] - points, axis=1)
+    info = _json(truth / "trans.json")["trans_info"]
+    true = [
+        parse_joint(e, f"{truth / 'trans.json'}: joint {i}")
+        for i, e in enumerate(info if isinstance(info, list) else [info])
+    ]
+    found = [moved_joint(p.joint, T) for p in load_twin(run).parts if p.joint is not None]
+    joints = JointError()
+    joints.update(found, true)
+    result = {
+        "format": "p2gs-capture-metrics/1", "metres_per_unit": float(np.cbrt(np.linalg.det(T[:3, :3]))),
+        "state_misalignment_mm": None if off is None else 1000 * float(off.mean()), "joints": joints.report.to_dict(),
+    }  # fmt: skip
+    (run / "capture_metrics.json").write_text(json.dumps(result, indent=1) + "\n")
+    return result
+
+
+def capture_lines(result: dict) -> list[str]:
+    """The result as lines for the terminal."""
+    off, joints = result["state_misalignment_mm"], result["joints"]
+    lines = [f"metres per unit: {result['metres_per_unit']:.5f}"]
+    lines += [] if off is None else [f"states apart on the base: {off:.2f} mm"]
+    for j in joints["joints"]:
+        e = j["errors"]
+        if e is None:
+            lines.append(
+                f"joint {j['gt'] + 1} ({j['type']}): F, "
+                + ("not found" if j["pred"] is None else f"found as {j['pred_type']}")
+            )
+            continue
+        place = "" if e["axis_position"] is None else f", axis {100 * e['axis_position']:.1f} mm off"
+        motion = f"{e['motion']:.2f} deg" if j["type"] == "revolute" else f"{1000 * e['motion']:.1f} mm"
+        lines.append(f"joint {j['gt'] + 1} ({j['type']}): axis {e['axis_angle']:.2f} deg{place}, motion {motion}")
+    return [*lines, f"{joints['failures']} failed, {len(joints['extra'])} extra"]

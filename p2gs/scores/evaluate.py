@@ -1,0 +1,163 @@
+"""Scores of a finished run: joints, surfaces and pictures against what the scene has. The only command that opens ground truth.
+
+``RUN/metrics.json`` (format p2gs-metrics/1), every length in input units, missing things left out and told in ``missing``:
+
+    scene, num_parts, gaussians            name of the scene; counts of the twin
+    parts        [{id, gaussians}]
+    joints       {joints: [{gt, type, pred, pred_type, errors: {axis_angle, axis_position, motion} | null}], failures, extra, ...means}:
+                 see metrics.joints.JointReport (axis_angle degrees, axis_position x10, motion degrees or length)
+    views        {start, end, mean}: {split, count, psnr_white, psnr_black, ssim_white, ssim_black, psnr_masked, lpips (over white;
+                 only with torchvision and its AlexNet weights at hand, see metrics.lpips), alpha_error,
+                 depth_median, depth_p90, depth_bad}: photographs that the fit did not train on where there are any; psnr_masked over
+                 the object's pixels only, alpha_error mean |alpha - mask|, depth_* of |expected depth - true| on the object,
+                 depth_bad the fraction off by more than 1 % of the object's diagonal
+    chamfer      {static|movable|whole: {value, floor}, parts, failures}: x1000, see metrics.chamfer.ChamferReport
+    penetration  {mean, max}: fraction of the moving Gaussians inside the base, over five states
+    slots        with exact_parts: what became of every part slot, see models.slots.slot_report
+    seconds      time the evaluation took
+    missing      sentences
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Optional
+
+import numpy as np
+
+from p2gs.gaussians.paint import draw, rasterizer_of
+from p2gs.gaussians.pose import pose
+from p2gs.gaussians.twin_json import load_twin
+from p2gs.gaussians.views import bounds
+from p2gs.metrics.lpips import wanted as lpips_wanted
+from p2gs.metrics.lpips import why_absent
+from p2gs.metrics.modules import JointError, PartChamfer, Penetration, ViewQuality
+from p2gs.models.registered import as_fitted
+from p2gs.surface.mesh import read_mesh, read_meshes
+from p2gs.surface.protocol import surface_options
+from p2gs.types import ArticulatedObject, TwoStateScene, UserError
+
+if TYPE_CHECKING:
+    from p2gs.data.ground_truth import GroundTruth
+
+FORMAT = "p2gs-metrics/1"
+STATES = ("start", "end")
+
+
+def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict:
+    """Score a run, write RUN/metrics.json and return what it holds.
+
+    root: the scene's folder where it has moved since the fit. Raises UserError when the run is not finished or the scene's
+    photographs cannot be read; a scene without ground truth is scored by its photographs alone.
+    """
+    began = time.perf_counter()
+    run_dir = Path(run_dir)
+    obj = load_twin(run_dir)
+    scene, truth = open_scene(run_dir, root)
+    missing: list[str] = []
+    metrics = {"format": FORMAT, "scene": scene.name, "num_parts": len(obj.parts), "gaussians": len(obj.gaussians)}
+    metrics["parts"] = [{"id": p.id, "gaussians": int((obj.part_ids == p.id).sum())} for p in obj.parts]
+    if truth is None:
+        missing.append("the scene has no ground-truth joints or meshes")
+    else:
+        joints = JointError()
+        joints.update([p.joint for p in obj.parts if p.joint is not None], truth.joints)
+        metrics["joints"] = joints.report.to_dict()
+        chamfer = surface_scores(run_dir, truth, joints.report.assignment, missing)
+        metrics |= {} if chamfer is None else {"chamfer": chamfer}
+    with rasterizer_of(run_dir):
+        metrics["views"] = view_scores(obj, scene, missing)
+    inside = Penetration()
+    inside.update(obj)
+    metrics["penetration"] = inside.means()
+    if (run_dir / "slots.json").is_file():
+        metrics["slots"] = json.loads((run_dir / "slots.json").read_text())
+    metrics["seconds"] = round(time.perf_counter() - began, 2)
+    metrics["missing"] = missing
+    path = run_dir / "metrics.json"
+    path.with_suffix(".tmp").write_text(json.dumps(metrics, indent=1) + "\n")
+    path.with_suffix(".tmp").replace(path)
+    return metrics
+
+
+def open_scene(run_dir: Path, root: Optional[Path | str] = None):
+    """The scene of a run in input coordinates, its photographs corrected as the fit did, and its ground truth or None.
+
+    The truth is the start's frame: the start's cameras are the ones it was measured with.
+    """
+    from p2gs.config.run import load_config
+    from p2gs.data.ground_truth import load_ground_truth
+    from p2gs.data.layouts import LAYOUTS
+
+    path = Path(run_dir) / "config.yaml"
+    if not path.is_file():
+        raise UserError(f"{path} is missing, so the scene of this run is not known")
+    cfg = load_config([str(path)], [] if root is None else ["--data.root", str(root)])
+    scene = cfg.data.raw_scene()
+    folder, name = getattr(cfg.data, "root", None), cfg.data_options["format"]
+    truth = None if folder is None else load_ground_truth(folder, name if name in LAYOUTS else None, cfg.data_options.get("source"))
+    return as_fitted(scene, run_dir), truth
+
+
+def scene_folder(run_dir: Path) -> Path:
+    """The folder of a run's scene, by the run's config.yaml. Raises UserError where that is missing."""
+    from p2gs.config.run import load_config
+
+    path = Path(run_dir) / "config.yaml"
+    if not path.is_file():
+        raise UserError(f"{path} is missing, so the scene of this run is not known")
+    return Path(load_config([str(path)], []).data.root)
+
+
+def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]) -> dict:
+    """Photometric and depth errors of both states and their mean. ``obj`` and ``scene`` in one coordinate system."""
+    diagonal = float((bounds(obj)[1] - bounds(obj)[0]).norm())
+    out = {}
+    for state, name in enumerate(STATES):
+        split = "test" if scene.select(state, "test") else "val" if scene.select(state, "val") else "train"
+        views = scene.select(state, split)
+        if split == "train" and views:
+            missing.append(f"the {name} state has no test views: its training views are scored")
+        if not views:
+            missing.append(f"the {name} state has no photographs")
+            continue
+        gaussians, quality = pose(obj, float(state)), ViewQuality()
+        for view in views:
+            quality.update(draw(gaussians, view.camera, 0.0), view, diagonal)
+        out[name] = {"split": split, "count": len(views)} | quality.means()
+    if out and lpips_wanted() and why_absent() is not None:
+        missing.append(why_absent())
+    if out and not any("depth_median" in s for s in out.values()):
+        missing.append("the scene has no depth maps")
+    both = [{k: v for k, v in s.items() if k not in ("split", "count")} for s in out.values()]
+    if both:
+        out["mean"] = _means(both)
+    return out
+
+
+def surface_scores(run_dir: Path, truth: "GroundTruth", assignment: dict[int, int], missing: list[str]) -> Optional[dict]:
+    """Chamfer distances of RUN/meshes against the ground truth's; None where either is missing."""
+    from p2gs.metrics.chamfer import PartMeshes, read_part_meshes
+
+    pred, gt = {}, {}
+    for state, name in enumerate(STATES):
+        made, true = read_meshes(run_dir, name), truth.meshes(state)
+        if made is None:
+            missing.append("the run has no meshes (p2gs export RUN --format ply makes them)")
+            return None
+        if true.static is None or not true.dynamic:
+            missing.append(f"the ground truth has no meshes of the {name} state's parts")
+            return None
+        whole_apart = surface_options(run_dir).whole == "separate"
+        pred[name] = PartMeshes(made[0], made[1:], read_mesh(Path(run_dir) / "meshes" / name / "whole.ply") if whole_apart else None)
+        gt[name] = read_part_meshes(true.whole, true.static, true.dynamic)
+    chamfer = PartChamfer()
+    chamfer.update(pred, gt, assignment)
+    return chamfer.report.to_dict()
+
+
+def _means(rows: list[dict]) -> dict[str, float]:
+    keys = dict.fromkeys(k for row in rows for k in row)
+    return {k: float(np.mean([row[k] for row in rows if k in row])) for k in keys}
