@@ -1,10 +1,13 @@
-"""What the measures of a joint (``motion/joint_confidence.py``) say of the chance that it is right: data, and the map fitted to them.
+"""What the measures of a joint (``motion/joint_confidence.py``) say of the chance that it is right: data, and the map
+fitted to them.
 
     python bench/confidence.py RUN... [--zoo DIR] --out FILE     # a line of JSON per joint, right ones and wrong ones
-    python bench/confidence.py --fit FILE                        # the numbers that ship, and how they do on scenes left out
+    python bench/confidence.py --fit FILE                        # the numbers that ship, and how they do on scenes left
+    out
 
-RUN holds a whole fit of a scene of the tuning set. Besides its own joints, sets of motions that the search considered are refined and
-measured as the last stage does it. This tool reads ground truth, which no phase may; the numbers that it prints are the one exception.
+RUN holds a whole fit of a scene of the tuning set. Besides its own joints, sets of motions that the search considered
+are refined and measured as the last stage does it. This tool reads ground truth, which no phase may; the numbers that
+it prints are the one exception.
 """
 
 from __future__ import annotations
@@ -36,7 +39,10 @@ from p2gs.visibility.evidence import gather_evidence
 
 def searched(case: Case) -> SimpleNamespace:
     """Discovery's problem and search, of the states as discovery sees them."""
-    config, options = case.cfg.phases["discovery"].config, {"backend": case.cfg.rasterizer, "device": case.pipeline.device}
+    config, options = (
+        case.cfg.phases["discovery"].config,
+        {"backend": case.cfg.rasterizer, "device": case.pipeline.device},
+    )
     train = [case.scene.select(state=s.state, split="train") for s in case.states]
     seen = [
         gather_evidence(s.gaussians, v, config.evidence_size, config.min_opacity, **options)
@@ -44,8 +50,12 @@ def searched(case: Case) -> SimpleNamespace:
     ]
     problem = build_problem(*seen, config.search, case.cfg.seed)[0]
     samples = [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in problem.samples]
-    search = Search(problem, sweep(problem, directions(problem), samples), config.search.max_parts - 1, config.search.part_cost)
-    return SimpleNamespace(problem=problem, graphs=[Graph(s.points, s.normals, s.colours) for s in problem.surfels], search=search)
+    search = Search(
+        problem, sweep(problem, directions(problem), samples), config.search.max_parts - 1, config.search.part_cost
+    )
+    return SimpleNamespace(
+        problem=problem, graphs=[Graph(s.points, s.normals, s.colours) for s in problem.surfels], search=search
+    )
 
 
 def considered(found: SimpleNamespace, own: PartMotions, sets: int) -> list[tuple[torch.Tensor, list[str]]]:
@@ -53,7 +63,12 @@ def considered(found: SimpleNamespace, own: PartMotions, sets: int) -> list[tupl
     out = []
     for _, chosen in found.search.solve()[:sets]:
         m = found.search.pool.motions[torch.tensor(chosen)]
-        out.append((torch.stack([m.transform(k) for k in range(len(m))]), ["revolute" if bool(t) else "prismatic" for t in m.turn]))
+        out.append(
+            (
+                torch.stack([m.transform(k) for k in range(len(m))]),
+                ["revolute" if bool(t) else "prismatic" for t in m.turn],
+            )
+        )
     for k in range(len(own)):
         for T, kind in instead_of(found, own.transforms, own.types, k, count=1):
             changed = own.with_motion(k, kind, T)
@@ -62,8 +77,8 @@ def considered(found: SimpleNamespace, own: PartMotions, sets: int) -> list[tupl
 
 
 def displaced(case: Case, own: PartMotions, sizes=(0.02, 0.06)) -> list[tuple[torch.Tensor, list[str]]]:
-    """The run's own motions with each part off by ``sizes`` (internal units), every part in another of its freedoms: wrong joints
-    that nothing has refined."""
+    """The run's own motions with each part off by ``sizes`` (internal units), every part in another of its freedoms:
+    wrong joints that nothing has refined."""
     out = []
     points = [case.states[0].gaussians.means[own.labels[0] == k + 1].double() for k in range(len(own))]
     for number, size in enumerate(sizes):
@@ -77,7 +92,9 @@ def displaced(case: Case, own: PartMotions, sizes=(0.02, 0.06)) -> list[tuple[to
     return out
 
 
-def measured(case: Case, found, states, stacks, level: int, transforms: torch.Tensor, types: list[str], refined: bool) -> list[dict]:
+def measured(
+    case: Case, found, states, stacks, level: int, transforms: torch.Tensor, types: list[str], refined: bool
+) -> list[dict]:
     """Each joint's measures, after the last stage's refinement if ``refined``, and whether it is right."""
     config, views = case.cfg.phases["finish"].config, case.pipeline.views
     options = {"backend": case.cfg.rasterizer, "device": case.pipeline.device}
@@ -103,7 +120,9 @@ def own_joints(case: Case, run: Path) -> list[dict]:
     joints = [p["joint"] for p in json.loads((run / "twin.json").read_text())["parts"][1:]]
     if not joints:
         return []
-    transforms = torch.stack([to_training(torch.tensor(j["transform"], dtype=torch.float64), case.similarity) for j in joints])
+    transforms = torch.stack(
+        [to_training(torch.tensor(j["transform"], dtype=torch.float64), case.similarity) for j in joints]
+    )
     measures = json.loads((run / "diagnostics.json").read_text())["joints"]
     for m in measures:
         m["disagreement"] *= case.similarity.scale  # the file's is in the scene's units
@@ -127,7 +146,8 @@ def gather(run: Path, zoo: Path, sets: int, out: Path) -> None:
 
 
 def fitted(x: np.ndarray, right: np.ndarray, weight: np.ndarray, damping: float = 0.001) -> np.ndarray:
-    """Weights [F + 1] of features [N, F], no one negative, the constant last: logistic regression with a little damping."""
+    """Weights [F + 1] of features [N, F], no one negative, the constant last: logistic regression with a little
+    damping."""
 
     def loss(w):
         z = x @ w[:-1] + w[-1]
@@ -142,9 +162,8 @@ def fit(file: Path) -> None:
     names = list(JointEvidence.__dataclass_fields__)
     x = np.array([features(JointEvidence(**{n: r[n] for n in names})) for r in rows])
     right, scene = np.array([r["right"] for r in rows]), np.array([r["name"] for r in rows])
-    weight = 1 / np.array(
-        [np.sum((scene == s) & (right == y)) for s, y in zip(scene, right, strict=True)]
-    )  # each scene's right, wrong alike
+    # each scene's right, wrong alike
+    weight = 1 / np.array([np.sum((scene == s) & (right == y)) for s, y in zip(scene, right, strict=True)])
     guess = np.zeros(len(rows))
     for name in sorted(set(scene)):
         w = fitted(x[scene != name], right[scene != name], weight[scene != name])
@@ -153,7 +172,9 @@ def fit(file: Path) -> None:
     print(f"{len(rows)} joints of {len(set(scene))} scenes, {right.sum()} right")
     for name, p in (("left out", guess), ("before", old)):
         brier = float((weight @ (p - right) ** 2) / weight.sum())
-        print(f"{name}: Brier {brier:.3f}, right over 0.5 {np.mean(p[right] > 0.5):.2f}, wrong over 0.5 {np.mean(p[~right] > 0.5):.2f}")
+        print(
+            f"{name}: Brier {brier:.3f}, right over 0.5 {np.mean(p[right] > 0.5):.2f}, wrong over 0.5 {np.mean(p[~right] > 0.5):.2f}"
+        )
     print("weights", [round(float(v), 3) for v in fitted(x, right, weight)])
 
 
@@ -161,7 +182,9 @@ def main() -> None:
     if "--fit" in sys.argv:
         return fit(Path(sys.argv[sys.argv.index("--fit") + 1]))
     parser = runs_parser(__doc__.splitlines()[0])
-    parser.add_argument("--sets", type=int, default=3, help="sets of motions that the search likes, besides the run's own joints")
+    parser.add_argument(
+        "--sets", type=int, default=3, help="sets of motions that the search likes, besides the run's own joints"
+    )
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     for run in args.runs:

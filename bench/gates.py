@@ -2,9 +2,10 @@
 
     python bench/gates.py RUN... [--zoo DIR] [--out FILE] [--search]
 
-RUN holds the single states of a scene. (1, with --search) Is the energy at the true motions lower than at those that are found? (2) How far
-does refinement that starts at the true motions leave them? Every Gaussian has its best label under the motions. A line of JSON per run goes
-to FILE: displacement of each part's points (units of the object scaled to 1) and turn (degrees) away from the truth; energies.
+RUN holds the single states of a scene. (1, with --search) Is the energy at the true motions lower than at those that
+are found? (2) How far does refinement that starts at the true motions leave them? Every Gaussian has its best label
+under the motions. A line of JSON per run goes to FILE: displacement of each part's points (units of the object scaled
+to 1) and turn (degrees) away from the truth; energies.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ def true_motions(case: Case) -> tuple[torch.Tensor, list[str]]:
         axis = torch.nn.functional.normalize(torch.as_tensor(joint.axis).double(), dim=0)
         T = torch.eye(4, dtype=torch.float64)
         if joint.type == "revolute":
-            T = se3.from_screw(axis, torch.as_tensor(joint.origin).double(), torch.deg2rad(torch.tensor(float(joint.motion)).double()))
+            T = se3.from_screw(
+                axis, torch.as_tensor(joint.origin).double(), torch.deg2rad(torch.tensor(float(joint.motion)).double())
+            )
         else:
             T[:3, 3] = axis * float(joint.motion)
         out.append(to_training(T, case.similarity))
@@ -46,7 +49,8 @@ def labelled(case: Case, found, transforms: torch.Tensor, types: list[str]) -> P
 
 
 def left(case: Case, motions: PartMotions, truth: torch.Tensor) -> list[tuple[float, float]]:
-    """Mean displacement of each part's points at the start against the true motion's, and the turn between both in degrees."""
+    """Mean displacement of each part's points at the start against the true motion's, and the turn between both in
+    degrees."""
     out = []
     for k, T in enumerate(truth):
         points = case.states[0].gaussians.means[motions.labels[0] == k + 1].double()
@@ -61,7 +65,13 @@ def gates(case: Case, search: bool) -> dict:
     config, views = case.cfg.phases["discovery"].config, case.pipeline.views
     options = {"backend": case.cfg.rasterizer, "device": case.pipeline.device}
     seen = [
-        gather_evidence(s.gaussians, case.scene.select(state=s.state, split="train"), config.evidence_size, config.min_opacity, **options)
+        gather_evidence(
+            s.gaussians,
+            case.scene.select(state=s.state, split="train"),
+            config.evidence_size,
+            config.min_opacity,
+            **options,
+        )
         for s in case.states
     ]
     truth, types = true_motions(case)
@@ -69,7 +79,9 @@ def gates(case: Case, search: bool) -> dict:
         found = discover(*seen, case.cfg.num_parts, config.search, case.cfg.seed)
     else:
         problem = build_problem(*seen, config.search, case.cfg.seed)[0]
-        found = SimpleNamespace(problem=problem, graphs=[Graph(s.points, s.normals, s.colours) for s in problem.surfels])
+        found = SimpleNamespace(
+            problem=problem, graphs=[Graph(s.points, s.normals, s.colours) for s in problem.surfels]
+        )
     judge = Judge(found, case.states, views, config.coarse, found.problem.stacks, seed=case.cfg.seed, **options)
     motions = labelled(case, found, truth, types)
     refined = judge.refine(motions)

@@ -1,10 +1,12 @@
-"""The oracle ladder of part discovery: which step loses which joint? A bench tool that reads ground truth, which no phase may.
+"""The oracle ladder of part discovery: which step loses which joint? A bench tool that reads ground truth, which no
+phase may.
 
     python bench/ladder.py RUN... [--zoo DIR] [--out FILE]
 
-RUN holds the single states of a scene (``p2gs fit ... --only single_state``). Discovery is run from them, anew, with this build's defaults,
-and its joints are held against the true ones: right is type, axis <= 1 deg, position x10 <= 0.15, motion <= 1 deg or 0.01, or a listed tie.
-A line of JSON per run goes to FILE. DIR: the zoo's lists of scenes and ties.
+RUN holds the single states of a scene (``p2gs fit ... --only single_state``). Discovery is run from them, anew, with
+this build's defaults, and its joints are held against the true ones: right is type, axis <= 1 deg, position x10 <=
+0.15, motion <= 1 deg or 0.01, or a listed tie. A line of JSON per run goes to FILE. DIR: the zoo's lists of scenes and
+ties.
 """
 
 from __future__ import annotations
@@ -49,14 +51,20 @@ def joint_of(T: torch.Tensor, kind: str) -> SimpleNamespace:
     """A transform [4, 4] as the joint that the metrics read."""
     if kind == "prismatic":
         length = T[:3, 3].norm()
-        return SimpleNamespace(type=kind, axis=T[:3, 3] / length.clamp_min(1e-9), origin=torch.zeros(3).double(), motion=float(length))
+        return SimpleNamespace(
+            type=kind, axis=T[:3, 3] / length.clamp_min(1e-9), origin=torch.zeros(3).double(), motion=float(length)
+        )
     screw = se3.screw_parameters(T)
     return SimpleNamespace(type=kind, axis=screw.axis, origin=screw.origin, motion=math.degrees(float(screw.angle)))
 
 
 def ties_of(name: str, zoo: Path) -> dict[str, list[float]]:
     """Other turns (degrees) that explain a scene's joints as well, by joint's index in its scenes.tsv line."""
-    lines = [line.split("\t") for line in (zoo / "ties.tsv").read_text().splitlines()] if (zoo / "ties.tsv").exists() else []
+    lines = (
+        [line.split("\t") for line in (zoo / "ties.tsv").read_text().splitlines()]
+        if (zoo / "ties.tsv").exists()
+        else []
+    )
     return {joint: [float(x) for x in other.split(",")] for scene, joint, _, other in lines if scene == name}
 
 
@@ -67,17 +75,24 @@ def is_right(gt, pred, others: list[float]) -> bool:
     for motion in [gt.motion, *others]:
         e = joint_errors(pred, SimpleNamespace(type=gt.type, axis=gt.axis, origin=gt.origin, motion=motion))
         bound = RIGHT["turn"] if gt.type == "revolute" else RIGHT["slide"]
-        if e.axis_angle <= RIGHT["axis_angle"] and (e.axis_position or 0) <= RIGHT["axis_position"] and e.motion <= bound:
+        if (
+            e.axis_angle <= RIGHT["axis_angle"]
+            and (e.axis_position or 0) <= RIGHT["axis_position"]
+            and e.motion <= bound
+        ):
             return True
     return False
 
 
 def paired(found: list, truth: list, right: np.ndarray) -> dict[int, int]:
-    """True joint -> found joint: as many as can be of those that are ``right`` [truth, found], the others as the metrics pair them.
-    Two crosses of a tap may turn about one line, and what is a tie for one is then the other's turn to the metrics."""
+    """True joint -> found joint: as many as can be of those that are ``right`` [truth, found], the others as the
+    metrics pair them. Two crosses of a tap may turn about one line, and what is a tie for one is then the other's turn
+    to the metrics."""
     rows, columns = linear_sum_assignment(right, maximize=True)
     pairs = {int(i): int(j) for i, j in zip(rows, columns, strict=True) if right[i, j]}
-    rest = [[i for i in range(len(of)) if i not in used] for of, used in ((truth, pairs.keys()), (found, pairs.values()))]
+    rest = [
+        [i for i in range(len(of)) if i not in used] for of, used in ((truth, pairs.keys()), (found, pairs.values()))
+    ]
     left = match_joints([found[j] for j in rest[1]], [truth[i] for i in rest[0]])
     return pairs | {rest[0][i]: rest[1][j] for i, j in left.items()}
 
@@ -88,11 +103,20 @@ class Case:
     def __init__(self, run: Path, zoo: Path, preset: str = "configs/preset/cpu.yaml"):
         self.name = run.name
         root = yaml.safe_load((run / "config.yaml").read_text())["data"]["root"]  # all else is this build's default
-        self.pipeline = Pipeline(load_config([preset], ["--data.root", root, "--data.depth", "never", "--run", str(run)]))
+        self.pipeline = Pipeline(
+            load_config([preset], ["--data.root", root, "--data.depth", "never", "--run", str(run)])
+        )
         self.states = [handover.load(run / "checkpoints" / f"single_state_{s}.pt")[0] for s in (0, 1)]
         self.scene, self.cfg = self.pipeline.scene, self.pipeline.cfg
         self.truth = load_ground_truth(self.cfg.data.root)
-        names = next((row.split("\t")[3] for row in (zoo / "scenes.tsv").read_text().splitlines() if row.split("\t")[2] == self.name), "")
+        names = next(
+            (
+                row.split("\t")[3]
+                for row in (zoo / "scenes.tsv").read_text().splitlines()
+                if row.split("\t")[2] == self.name
+            ),
+            "",
+        )
         self.joints = [part.split("=")[0] for part in names.split(",")] if names else []
         self.ties = ties_of(self.name, zoo)
 
@@ -102,10 +126,14 @@ class Case:
 
     def score(self, transforms: torch.Tensor, types: list[str]) -> dict:
         """Each true joint's errors and whether it is right; how many parts are too many."""
-        found = [joint_of(to_input(T.double(), self.similarity), kind) for T, kind in zip(transforms, types, strict=True)]
+        found = [
+            joint_of(to_input(T.double(), self.similarity), kind) for T, kind in zip(transforms, types, strict=True)
+        ]
         truth = self.truth.joints
         others = [self.ties.get(name, []) for name in self.joints] or [[] for _ in truth]
-        right = np.array([[is_right(gt, p, o) for p in found] for gt, o in zip(truth, others, strict=True)]).reshape(len(truth), len(found))
+        right = np.array([[is_right(gt, p, o) for p in found] for gt, o in zip(truth, others, strict=True)]).reshape(
+            len(truth), len(found)
+        )
         metric = JointError()
         metric.update(found, truth, paired(found, truth, right))
         report = metric.report

@@ -4,15 +4,16 @@
 
 Every part's distance (x1000, mean of the states, as ``p2gs test`` has it) is split into terms that sum to it:
 
-    seen      true points that three training photographs of a state see, as far as the nearest reconstructed point is within NEAR of them,
+    seen      true points that three training photographs of a state see, as far as the nearest reconstructed point is
+    within NEAR of them,
               and reconstructed points within NEAR of such a true point
     lost      other true points that were seen
     hidden    true points that were not seen
     false     other reconstructed points, in space that three photographs look through
     closing   other reconstructed points: surface in space that nobody saw
 
-``seen``'s floor is what the true surface's samples score against one another. Beside it the bound: the true seen surface alone.
-A line of JSON per run goes to FILE.
+``seen``'s floor is what the true surface's samples score against one another. Beside it the bound: the true seen
+surface alone. A line of JSON per run goes to FILE.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from p2gs.ops.mesh import Mesh, largest_components
 from p2gs.scores.evaluate import open_scene
 from p2gs.types import Camera
 
-NEAR = 0.02  # of the object's size (half the longest side of a unit-sphere object is .5 to 1): three voxels of a mesh, five pixels
+# of the object's size (half the longest side of a unit-sphere object is .5 to 1): three voxels of a mesh, five pixels
+NEAR = 0.02
 ENOUGH = 3  # photographs
 TERMS = ("seen", "lost", "hidden", "false", "closing")
 
@@ -78,8 +80,8 @@ class Truth:
         return points if to == state else points @ T[:3, :3].T + T[:3, 3]
 
     def looks(self, points: np.ndarray, state: int, margin: float) -> tuple[np.ndarray, np.ndarray]:
-        """How many photographs of a state see points [N, 3] (nothing stands more than ``margin`` before them), and how many look through
-        them (nothing stands before or up to ``margin`` behind them), [N] each."""
+        """How many photographs of a state see points [N, 3] (nothing stands more than ``margin`` before them), and how
+        many look through them (nothing stands before or up to ``margin`` behind them), [N] each."""
         seen, through = np.zeros((2, len(points)), int)
         for s, camera in self.views:
             if s != state:
@@ -103,7 +105,8 @@ def within(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def split_part(truth: Truth, part: int, made: list[Mesh], margin: float) -> tuple[dict[str, float], float, float]:
-    """Terms of one part's Chamfer distance (x1000, mean of the states), the floor of ``seen``, and the score of the true seen surface.
+    """Terms of one part's Chamfer distance (x1000, mean of the states), the floor of ``seen``, and the score of the
+    true seen surface.
 
     made: its meshes by state.
     """
@@ -126,11 +129,18 @@ def split_part(truth: Truth, part: int, made: list[Mesh], margin: float) -> tupl
         beside = search_tree(true[seen]).query(points)[0] < near if seen.any() else np.zeros(len(points), bool)
         through = [truth.looks(truth.at(points, part, state, s), s, margin)[1] >= ENOUGH for s in (0, 1)]
         through = through[0] | through[1]
-        rows = {"lost": seen & (to_made >= near), "hidden": ~seen, "false": ~beside & through, "closing": ~beside & ~through}
+        rows = {
+            "lost": seen & (to_made >= near),
+            "hidden": ~seen,
+            "false": ~beside & through,
+            "closing": ~beside & ~through,
+        }
         for name, which in rows.items():
             d = to_made if name in ("lost", "hidden") else from_made
             terms[name] += 500 * float((d[which] ** 2).sum()) / POINTS
-        terms["seen"] += 500 * float((to_made[seen & (to_made < near)] ** 2).sum() + (from_made[beside] ** 2).sum()) / POINTS
+        terms["seen"] += (
+            500 * float((to_made[seen & (to_made < near)] ** 2).sum() + (from_made[beside] ** 2).sum()) / POINTS
+        )
     return terms, floor, bound
 
 
@@ -147,7 +157,11 @@ def of_run(run: Path, truth: Truth) -> list[list[Mesh]]:
     """The run's meshes in the order of the true parts, an empty one where a part was not found."""
     from p2gs.surface.mesh import read_meshes
 
-    assignment = {j["gt"]: j["pred"] for j in json.loads((run / "metrics.json").read_text())["joints"]["joints"] if j["errors"] is not None}
+    assignment = {
+        j["gt"]: j["pred"]
+        for j in json.loads((run / "metrics.json").read_text())["joints"]["joints"]
+        if j["errors"] is not None
+    }
     out = []
     for name in ("start", "end"):
         made = read_meshes(run, name)

@@ -1,4 +1,5 @@
-"""The command line: its parser (standard library only) and the way from words to a command of ``p2gs.commands``, with readable errors."""
+"""The command line: its parser (standard library only) and the way from words to a command of ``p2gs.commands``, with
+readable errors."""
 
 from __future__ import annotations
 
@@ -44,7 +45,9 @@ class Parser(argparse.ArgumentParser):
 
 def parser(prog: str = "p2gs") -> Parser:
     """The parser of all commands."""
-    top = Parser(prog=prog, description="Photographs of an object in two joint states to an articulated digital twin (Part2GS).")
+    top = Parser(
+        prog=prog, description="Photographs of an object in two joint states to an articulated digital twin (Part2GS)."
+    )
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
 
     def add(name: str, text: str, **kwargs) -> Parser:
@@ -65,7 +68,10 @@ def parser(prog: str = "p2gs") -> Parser:
     fit.add_argument("--seed", metavar="N", help="default 0")
     fit.add_argument("--device", metavar="auto|cpu|cuda", help="default auto")
     fit.add_argument("--threads", metavar="N", help="CPU threads (default all cores)")
-    strict: dict[str, Any] = {"action": "store_true", "help": "refuse files that lead out of the scene's folder (else they are only named)"}
+    strict: dict[str, Any] = {
+        "action": "store_true",
+        "help": "refuse files that lead out of the scene's folder (else they are only named)",
+    }
     fit.add_argument("--strict_paths", "--strict-paths", **strict)
 
     test = add("test", "score a run against the scene's ground truth and write metrics.json")
@@ -76,47 +82,79 @@ def parser(prog: str = "p2gs") -> Parser:
     predict = add("predict", "render a run's twin at any state between start (0) and end (1)")
     predict.add_argument("run", metavar="RUN", help="result folder of a fit")
     times = [0.0, 0.25, 0.5, 0.75, 1.0]
-    predict.add_argument("--times", type=float, nargs="+", default=times, metavar="T", help="states (default 0 .25 .5 .75 1)")
+    predict.add_argument(
+        "--times", type=float, nargs="+", default=times, metavar="T", help="states (default 0 .25 .5 .75 1)"
+    )
     predict.add_argument("--out", metavar="DIR", help="folder for the pictures (default RUN/media/states)")
     predict.add_argument("--size", type=int, metavar="PX", help="longer side of the pictures")
     predict.add_argument("--video", action="store_true", help="also a video of the motion")
 
     export = add("export", "write a run's twin in other formats")
     export.add_argument("run", metavar="RUN", help="result folder of a fit")
-    export.add_argument("--format", nargs="+", metavar="NAME", help="urdf, mjcf, glb, usd, splats, spz, ply, obj, all (default)")
+    export.add_argument(
+        "--format", nargs="+", metavar="NAME", help="urdf, mjcf, glb, usd, splats, spz, ply, obj, all (default)"
+    )
     told = "all that one simulator takes, named and textured, into --out: simready, isaac, mujoco, sapien, partnet"
     export.add_argument("--profile", metavar="NAME", help=told)
-    export.add_argument("--meta", metavar="FILE", help="YAML or JSON with author, asset_license, category, qcode, ... for --profile")
+    export.add_argument(
+        "--meta", metavar="FILE", help="YAML or JSON with author, asset_license, category, qcode, ... for --profile"
+    )
     export.add_argument("--out", metavar="DIR", help="folder to write to (default RUN)")
     stand = export.add_mutually_exclusive_group()
     told = "the base stands fast in the world (URDF: on a link 'world')"
     stand.add_argument("--fixed_base", "--fixed-base", dest="fixed", action="store_true", default=None, help=told)
-    stand.add_argument("--floating", dest="fixed", action="store_false", default=None, help="the base may be pushed and fall over")
+    stand.add_argument(
+        "--floating", dest="fixed", action="store_false", default=None, help="the base may be pushed and fall over"
+    )
     size = export.add_mutually_exclusive_group()
     size.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of the input (default 1)")
-    size.add_argument("--height", type=float, metavar="M", help="the object's height at the start in metres, instead of --scale")
-    export.add_argument("--material", default="chipboard", help="density: chipboard (default), wood, plastic, metal, glass, ceramic")
-    told = "call parts by what they are (drawer, door, lid, ...), needs --out; those that geometry gets wrong as PART=NAME"
+    size.add_argument(
+        "--height", type=float, metavar="M", help="the object's height at the start in metres, instead of --scale"
+    )
+    export.add_argument(
+        "--material", default="chipboard", help="density: chipboard (default), wood, plastic, metal, glass, ceramic"
+    )
+    told = (
+        "call parts by what they are (drawer, door, lid, ...), needs --out; those that geometry gets wrong as PART=NAME"
+    )
     export.add_argument("--name", nargs="*", metavar="PART=NAME", help=told)
-    export.add_argument("--up", choices=("x", "y", "z"), help="axis that points up in the file (default: the format's own)")
-    export.add_argument("--extend_range", "--extend-range", action="store_true", help="joint limits until parts touch, not as observed")
-    export.add_argument("--texture", action="store_true", help="baked textures, for programs that show no vertex colours")
-    export.add_argument("--splats", action="store_true", help="each part's Gaussians in USD too (OpenUSD 26.03 and later show them)")
-    export.add_argument("--check", action="store_true", help="write nothing: run the files that are there in every engine installed")
-    export.add_argument("--origin", choices=("keep", "center", "bottom"), default="keep", help="where the origin is put (default keep)")
+    export.add_argument(
+        "--up", choices=("x", "y", "z"), help="axis that points up in the file (default: the format's own)"
+    )
+    export.add_argument(
+        "--extend_range", "--extend-range", action="store_true", help="joint limits until parts touch, not as observed"
+    )
+    export.add_argument(
+        "--texture", action="store_true", help="baked textures, for programs that show no vertex colours"
+    )
+    export.add_argument(
+        "--splats", action="store_true", help="each part's Gaussians in USD too (OpenUSD 26.03 and later show them)"
+    )
+    export.add_argument(
+        "--check", action="store_true", help="write nothing: run the files that are there in every engine installed"
+    )
+    export.add_argument(
+        "--origin", choices=("keep", "center", "bottom"), default="keep", help="where the origin is put (default keep)"
+    )
 
     view = add("view", "look at a run's twin in the browser")
     view.add_argument("run", metavar="RUN", help="result folder of a fit")
-    view.add_argument("--host", default="127.0.0.1", help="address to listen on (0.0.0.0: reachable from other machines)")
+    view.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (0.0.0.0: reachable from other machines)"
+    )
     view.add_argument("--port", type=int, default=8080)
 
     data = add("data", "check a scene folder or generate a scene")
     actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
-    check = actions.add_parser("check", help="name the problems of a scene folder", description="Name the problems of a scene folder.")
+    check = actions.add_parser(
+        "check", help="name the problems of a scene folder", description="Name the problems of a scene folder."
+    )
     check.add_argument("root", metavar="DIR")
     check.add_argument("--format", metavar="NAME", help="layout (default: found by looking)")
     check.add_argument("--strict_paths", "--strict-paths", **strict)
-    synth = actions.add_parser("synth", help="generate and ray-trace a small scene", description="Generate and ray-trace a small scene.")
+    synth = actions.add_parser(
+        "synth", help="generate and ray-trace a small scene", description="Generate and ray-trace a small scene."
+    )
     synth.add_argument("out", metavar="OUT", help="folder to write")
     synth.add_argument("--seed", type=int, default=0, metavar="S")
     synth.add_argument("--kind", metavar="NAME", help="kind of object")
@@ -129,33 +167,62 @@ def parser(prog: str = "p2gs") -> Parser:
     about = "Turn photographs (or videos) of two joint states into a scene."
     capture = actions.add_parser("capture", help="photographs of two states to a scene", description=about)
     capture.add_argument("start", metavar="SHUT", help="folder of photographs of the first state, or a video")
-    capture.add_argument("end", metavar="OPEN", help="the same of the second state; nothing but the parts may have moved")
+    capture.add_argument(
+        "end", metavar="OPEN", help="the same of the second state; nothing but the parts may have moved"
+    )
     capture.add_argument("--out", required=True, metavar="SCENE", help="folder to write")
-    capture.add_argument("--masks", metavar="DIR", help="masks of the object, white = object (default: alpha, else from 3D)")
+    capture.add_argument(
+        "--masks", metavar="DIR", help="masks of the object, white = object (default: alpha, else from 3D)"
+    )
     means: dict[str, Any] = {"choices": ("object", "ignore"), "default": "object", "help": "ignore: nerfstudio's masks"}
     capture.add_argument("--mask_means", "--mask-means", **means)
-    capture.add_argument("--poses", metavar="PATH", help="a COLMAP model or transforms.json of both states: no structure from motion")
-    capture.add_argument("--static", type=int, metavar="N", help="which hypothesis of capture.json is the room (default: the widest)")
-    capture.add_argument("--height", type=float, metavar="M", help="height of the object in metres, where there is no board")
-    capture.add_argument("--max_views", "--max-views", type=int, default=60, metavar="N", help="photographs a state (default 60)")
-    capture.add_argument("--size", type=int, default=1600, metavar="PX", help="longer side of the scene's images (default 1600)")
-    capture.add_argument("--careful", action="store_true", help="more features, every pair of photographs: several times slower")
-    board = actions.add_parser("board", help="a marker sheet to print, for scale and up", description="A marker sheet to print.")
+    capture.add_argument(
+        "--poses", metavar="PATH", help="a COLMAP model or transforms.json of both states: no structure from motion"
+    )
+    capture.add_argument(
+        "--static", type=int, metavar="N", help="which hypothesis of capture.json is the room (default: the widest)"
+    )
+    capture.add_argument(
+        "--height", type=float, metavar="M", help="height of the object in metres, where there is no board"
+    )
+    capture.add_argument(
+        "--max_views", "--max-views", type=int, default=60, metavar="N", help="photographs a state (default 60)"
+    )
+    capture.add_argument(
+        "--size", type=int, default=1600, metavar="PX", help="longer side of the scene's images (default 1600)"
+    )
+    capture.add_argument(
+        "--careful", action="store_true", help="more features, every pair of photographs: several times slower"
+    )
+    board = actions.add_parser(
+        "board", help="a marker sheet to print, for scale and up", description="A marker sheet to print."
+    )
     board.add_argument("--out", default="board.pdf", metavar="FILE", help="PDF or PNG (default board.pdf)")
 
     about = "Check a downloaded benchmark against the object lists."
     ready = actions.add_parser("prepare", help="check a downloaded benchmark", description=about)
     ready.add_argument("root", metavar="DIR", help="the downloaded tree")
-    ready.add_argument("--objects", nargs="+", default=["all"], metavar="NAME", help="benchmarks or object ids (default all)")
+    ready.add_argument(
+        "--objects", nargs="+", default=["all"], metavar="NAME", help="benchmarks or object ids (default all)"
+    )
 
     bench = add("bench", "run objects x settings x seeds; bench kernels: time the rasterizers", epilog=BENCH_HELP)
     bench.set_defaults(action="runs")
-    bench.add_argument("-c", "--config", **several, metavar="FILE", help="YAML files of benches, such as bench/paris.yaml")
+    bench.add_argument(
+        "-c", "--config", **several, metavar="FILE", help="YAML files of benches, such as bench/paris.yaml"
+    )
     bench.add_argument("--root", metavar="DIR", help="the tree that holds the objects")
     bench.add_argument("--out", metavar="DIR", help="result folder (default runs/bench/<name>)")
     bench.add_argument("--preset", metavar="NAME", help="instead of the bench's own preset, such as paper_literal")
-    bench.add_argument("--num_parts", metavar="N", help="of settings that say nothing of it: a number, auto, gt, gt+1, ...")
-    bench.add_argument("--objects", nargs="+", metavar="NAME", help="these instead: benchmarks, object ids or scene folders below --root")
+    bench.add_argument(
+        "--num_parts", metavar="N", help="of settings that say nothing of it: a number, auto, gt, gt+1, ..."
+    )
+    bench.add_argument(
+        "--objects",
+        nargs="+",
+        metavar="NAME",
+        help="these instead: benchmarks, object ids or scene folders below --root",
+    )
     bench.add_argument("--settings", nargs="+", metavar="NAME", help="only these settings")
     bench.add_argument("--seeds", nargs="+", metavar="N", help="default 0 1 2")
     bench.add_argument("--executor", metavar="local|slurm|ray", help="where the runs are carried out (default local)")
@@ -164,7 +231,9 @@ def parser(prog: str = "p2gs") -> Parser:
     bench.add_argument("--skip_failed", action="store_true", help="do not try again what failed before")
     table = add("table", "put a bench's results beside the paper's: Markdown, LaTeX, CSV, plots")
     table.add_argument("bench", metavar="BENCH_DIR", help="result folder of a bench")
-    table.add_argument("--tables", nargs="+", metavar="NAME", help="tables of the paper to fill (default: those that the bench names)")
+    table.add_argument(
+        "--tables", nargs="+", metavar="NAME", help="tables of the paper to fill (default: those that the bench names)"
+    )
     table.add_argument("--out", metavar="DIR", help="folder for the tables (default BENCH_DIR/tables)")
 
     add("version", "print the version")
@@ -179,7 +248,8 @@ def run(words: list[str], prog: str = "p2gs") -> int:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     try:
-        if words[:2] == ["bench", "kernels"]:  # has options of its own; a positional of bench would take the values of --key value
+        # has options of its own; a positional of bench would take the values of --key value
+        if words[:2] == ["bench", "kernels"]:
             args, rest = argparse.Namespace(command="bench", action="kernels"), words[2:]
         else:
             args, rest = top.parse_known_args(words)
@@ -188,7 +258,9 @@ def run(words: list[str], prog: str = "p2gs") -> int:
             return 0
         if rest and args.command not in ("fit", "bench"):
             command = f"{prog} {args.command}"
-            raise UsageError(f"'{rest[0]}' is no option of {command}{_similar(rest[0], top, args)} (see {command} --help)")
+            raise UsageError(
+                f"'{rest[0]}' is no option of {command}{_similar(rest[0], top, args)} (see {command} --help)"
+            )
         return _carry_out(args, rest)
     except UsageError as err:
         return _fail(str(err))

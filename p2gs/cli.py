@@ -1,5 +1,5 @@
-"""Console entry points. Standard library only, so that ``p2gs --help`` answers at once; the heavy part is imported by ``app`` when a
-command runs.
+"""Console entry points. Standard library only, so that ``p2gs --help`` answers at once; the heavy part is imported by
+``app`` when a command runs.
 """
 
 from __future__ import annotations
@@ -12,15 +12,18 @@ SDK = "lightning-sdk"
 
 
 def main(argv: Optional[Sequence[str]] = None, prog: str = "p2gs") -> int:
-    """``p2gs WORDS``. Returns the exit code: 0, 1 (the work failed), 2 (a mistake in the command or its input), 130 (interrupted)."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's idle threads would spin on cores that the kernels want
+    """``p2gs WORDS``. Returns the exit code: 0, 1 (the work failed), 2 (a mistake in the command or its input), 130
+    (interrupted)."""
+    # torch's idle threads would spin on cores that the kernels want
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     from p2gs.app import run
 
     return run(list(sys.argv[1:] if argv is None else argv), prog)
 
 
 def lightning_main(argv: Optional[Sequence[str]] = None) -> int:
-    """``lightning WORDS``: p2gs's own commands under Lightning's name; what is not ours goes on to lightning-sdk, who owns the name too."""
+    """``lightning WORDS``: p2gs's own commands under Lightning's name; what is not ours goes on to lightning-sdk, who
+    owns the name too."""
     words = list(sys.argv[1:] if argv is None else argv)
     from p2gs.app import COMMANDS
 

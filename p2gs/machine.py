@@ -1,4 +1,5 @@
-"""What a machine refuses (a full disk, a folder that cannot be written to, no memory), told in a sentence: no fault of the program's."""
+"""What a machine refuses (a full disk, a folder that cannot be written to, no memory), told in a sentence: no fault of
+the program's."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ REFUSALS = (
 
 
 def is_of_the_machine(err: BaseException) -> bool:
-    """Whether the error says that the machine did not do what it was asked to, rather than that the program is wrong."""
+    """Whether the error says that the machine did not do what it was asked to, rather than that the program is
+    wrong."""
     return isinstance(err, MemoryError) or (isinstance(err, OSError) and err.errno in REFUSALS)
 
 

@@ -1,4 +1,5 @@
-"""Name-keyed registries: a loss, callback, phase, dataset or rasterizer is found by the name it was registered under."""
+"""Name-keyed registries: a loss, callback, phase, dataset or rasterizer is found by the name it was registered
+under."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ T = TypeVar("T")
 
 
 class Registry(Generic[T]):
-    """Names to classes (or functions). A name can be given once; a wrong name is answered with the nearest right one."""
+    """Names to classes (or functions). A name can be given once; a wrong name is answered with the nearest right
+    one."""
 
     def __init__(self, kind: str):
         self.kind = kind
@@ -69,9 +71,11 @@ def suggest(name: str, known) -> str:
 
 
 def load_plugins(modules: tuple[str, ...] = ()) -> None:
-    """Import the user's modules, then those of the entry-point group ``p2gs.plugins`` and of ``P2GS_PLUGINS`` (comma-separated).
+    """Import the user's modules, then those of the entry-point group ``p2gs.plugins`` and of ``P2GS_PLUGINS``
+    (comma-separated).
 
-    The working directory is importable, as ``python -c`` would have it. Raises UserError when a module cannot be imported.
+    The working directory is importable, as ``python -c`` would have it. Raises UserError when a module cannot be
+    imported.
     """
     from importlib.metadata import entry_points
 

@@ -1,4 +1,5 @@
-"""One fit at a time in a result folder: a lock that the kernel gives back when its processes are gone, however they ended."""
+"""One fit at a time in a result folder: a lock that the kernel gives back when its processes are gone, however they
+ended."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ _held: list[int] = []
 
 
 def held() -> tuple[int, ...]:
-    """File descriptors of the locks that this process holds; a process that gets them keeps others out for as long as it runs."""
+    """File descriptors of the locks that this process holds; a process that gets them keeps others out for as long as
+    it runs."""
     return tuple(_held)
 
 
@@ -27,8 +29,8 @@ def held() -> tuple[int, ...]:
 def locked(run_dir: Path) -> Iterator[None]:
     """Hold RUN/checkpoints/.lock. Raises UserError where another fit runs in that folder.
 
-    Of a run that was killed a process may be left that saves its state: that one is waited for. File systems without locks (some network
-    shares) go unguarded, with a note.
+    Of a run that was killed a process may be left that saves its state: that one is waited for. File systems without
+    locks (some network shares) go unguarded, with a note.
     """
     import fcntl
 
@@ -49,13 +51,20 @@ def locked(run_dir: Path) -> Iterator[None]:
                         "or name another folder with --run"
                     ) from None
                 if gone and not told:
-                    print(f"{run_dir}: waiting for what is left of process {pid} to save its state", file=sys.stderr, flush=True)
+                    print(
+                        f"{run_dir}: waiting for what is left of process {pid} to save its state",
+                        file=sys.stderr,
+                        flush=True,
+                    )
                 told = told or gone
                 time.sleep(0.2)
             except OSError as err:
                 if err.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL):
                     raise
-                print(f"note: {path}: this file system has no locks ({err.strerror}); start no second fit in the folder", file=sys.stderr)
+                print(
+                    f"note: {path}: this file system has no locks ({err.strerror}); start no second fit in the folder",
+                    file=sys.stderr,
+                )
                 break
         file.truncate(0)
         file.write(f"{os.getpid()} {socket.gethostname()}\n")

@@ -13,14 +13,18 @@ def stages_file(run_dir: Path | str) -> Path:
 
 
 def note_stage(run_dir: Path | str, name: str, seconds: float, peak_memory: int, beside: Optional[str] = None) -> None:
-    """Write a stage's seconds (of a resumed one the last sitting's) and peak memory (MiB). beside: the stage that ran at the same time."""
+    """Write a stage's seconds (of a resumed one the last sitting's) and peak memory (MiB). beside: the stage that ran
+    at the same time."""
     path = stages_file(run_dir)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         times = json.loads(path.read_text())
-    except (FileNotFoundError, ValueError):  # a run that was killed while an older version wrote it; times are told, nothing hangs on them
+    # a run that was killed while an older version wrote it; times are told, nothing hangs on them
+    except (FileNotFoundError, ValueError):
         times = {}
-    times[name] = {"seconds": round(seconds, 2), "peak_memory_mib": peak_memory} | ({"beside": beside} if beside else {})
+    times[name] = {"seconds": round(seconds, 2), "peak_memory_mib": peak_memory} | (
+        {"beside": beside} if beside else {}
+    )
     part = path.with_suffix(".part")
     part.write_text(json.dumps(times, indent=1))
     os.replace(part, path)

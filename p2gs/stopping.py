@@ -1,4 +1,5 @@
-"""SIGTERM, as schedulers send it some seconds before SIGKILL: the state is saved, the exit code says that the run is not done."""
+"""SIGTERM, as schedulers send it some seconds before SIGKILL: the state is saved, the exit code says that the run is
+not done."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ class _State:
 
 @contextmanager
 def heeding_sigterm() -> Iterator[None]:
-    """Inside, SIGTERM raises Terminated where the main thread is; within ``at_step_ends`` when the step has been done."""
+    """Inside, SIGTERM raises Terminated where the main thread is; within ``at_step_ends`` when the step has been
+    done."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may set handlers
         return
@@ -37,8 +39,8 @@ def heeding_sigterm() -> Iterator[None]:
 
 @contextmanager
 def at_step_ends() -> Iterator[None]:
-    """Around a Trainer's fit: Lightning ends it after the step in which SIGTERM came (its handler calls ours), when parameters and
-    optimiser agree and the checkpoint callback can save them; that leaves here as Terminated."""
+    """Around a Trainer's fit: Lightning ends it after the step in which SIGTERM came (its handler calls ours), when
+    parameters and optimiser agree and the checkpoint callback can save them; that leaves here as Terminated."""
     from lightning.pytorch.utilities.exceptions import SIGTERMException
 
     _State.training, _State.asked = True, False

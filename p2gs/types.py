@@ -1,8 +1,8 @@
 """Shapes, units and conventions, stated once.
 
-Cameras are OpenCV (x right, y down, z forward). ``viewmat`` maps world to camera, ``K`` maps camera to pixels with pixel
-centres at +0.5. Quaternions are wxyz. State time ``t`` runs from 0 (start) to 1 (end). Alpha is straight on disk and in
-``View``; compositing is done in float. Units are the input's unless a ``Similarity`` says otherwise.
+Cameras are OpenCV (x right, y down, z forward). ``viewmat`` maps world to camera, ``K`` maps camera to pixels with
+pixel centres at +0.5. Quaternions are wxyz. State time ``t`` runs from 0 (start) to 1 (end). Alpha is straight on disk
+and in ``View``; compositing is done in float. Units are the input's unless a ``Similarity`` says otherwise.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Camera:
 class View:
     """One photograph.
 
-    image: [H, W, 3] uint8, straight (not premultiplied).  alpha: [H, W] uint8.  depth: [H, W] float32 along the camera's z
-    in scene units, 0 where unknown, or None.
+    image: [H, W, 3] uint8, straight (not premultiplied).  alpha: [H, W] uint8.  depth: [H, W] float32 along the
+    camera's z in scene units, 0 where unknown, or None.
     """
 
     name: str
@@ -106,7 +106,9 @@ class TwoStateScene:
     box: Optional[Tensor] = None
 
     def select(self, state: Optional[int] = None, split: Optional[Split] = None) -> tuple[View, ...]:
-        return tuple(v for v in self.views if (state is None or v.state == state) and (split is None or v.split == split))
+        return tuple(
+            v for v in self.views if (state is None or v.state == state) and (split is None or v.split == split)
+        )
 
     @property
     def has_depth(self) -> bool:
@@ -122,8 +124,8 @@ class TwoStateScene:
 class GaussianTensors:
     """Stored, unconstrained parameters of N Gaussians.
 
-    means [N, 3]; quats [N, 4] wxyz, any length; log_scales [N, 3]; opacity_logits [N]; sh [N, B, 3] with B = (degree+1)^2,
-    colour = 0.5 + SH (the 3DGS convention).
+    means [N, 3]; quats [N, 4] wxyz, any length; log_scales [N, 3]; opacity_logits [N]; sh [N, B, 3] with B =
+    (degree+1)^2, colour = 0.5 + SH (the 3DGS convention).
     """
 
     means: Tensor
@@ -160,11 +162,12 @@ class GaussianTensors:
 
 @dataclass
 class RenderOutput:
-    """What a rasterizer returns for one view of H x W pixels (accumulated = weighted sum over Gaussians, not normalised).
+    """What a rasterizer returns for one view of H x W pixels (accumulated = weighted sum over Gaussians, not
+    normalised).
 
-    colour [H, W, 3], background already blended in.  alpha [H, W].  depth [H, W]: accumulated z.  depth_sq [H, W] or None:
-    accumulated (z - depth_ref)^2.  median_depth [H, W] or None: z of the Gaussian where transmittance passes 0.5, 0 where it
-    never does (no gradient).  features [H, W, F] or None, accumulated.
+    colour [H, W, 3], background already blended in.  alpha [H, W].  depth [H, W]: accumulated z.  depth_sq [H, W] or
+    None: accumulated (z - depth_ref)^2.  median_depth [H, W] or None: z of the Gaussian where transmittance passes 0.5,
+    0 where it never does (no gradient).  features [H, W, F] or None, accumulated.
     radii [N] int32: screen radius in pixels, 0 where culled.  means2d_abs_grad [N] or None: see ``render.rasterize``.
     """
 
@@ -185,7 +188,8 @@ class RenderOutput:
 
     @property
     def depth_variance(self) -> Tensor:
-        """alpha * accumulated (z-ref)^2 - (accumulated (z-ref))^2, [H, W]: alpha^2 times the variance of z along the ray."""
+        """alpha * accumulated (z-ref)^2 - (accumulated (z-ref))^2, [H, W]: alpha^2 times the variance of z along the
+        ray."""
         if self.depth_sq is None:
             raise ValueError("depth_variance needs rasterize(..., depth_sq=True)")
         first = self.depth - self.depth_ref * self.alpha
@@ -196,7 +200,8 @@ class RenderOutput:
 class Joint:
     """A one-degree-of-freedom joint. axis [3] unit, origin [3] a point on the axis (prismatic: a point of the part).
 
-    motion: signed start -> end, degrees about the axis or length along it.  limits: (lo, hi) in the same unit, 0 = start.
+    motion: signed start -> end, degrees about the axis or length along it.  limits: (lo, hi) in the same unit, 0 =
+    start.
     transform: [4, 4] start -> end.
     """
 
@@ -223,7 +228,8 @@ class ArticulatedObject:
     """The twin: Gaussians at canonical time, a part id each, a joint per movable part.
 
     part_ids [N] int64 into ``parts``.  A point of part k goes from canonical time t_c to state t by
-    exp((t - t_c) * log(T_k)), T_k the joint's start -> end transform. Coordinates are internal; ``similarity`` goes back.
+    exp((t - t_c) * log(T_k)), T_k the joint's start -> end transform. Coordinates are internal; ``similarity`` goes
+    back.
     """
 
     gaussians: GaussianTensors
@@ -234,7 +240,8 @@ class ArticulatedObject:
 
 
 def short(value: object, length: int = 80) -> str:
-    """``repr`` of what a file holds, for a message: one line of at most about so many characters, however large or deep the value."""
+    """``repr`` of what a file holds, for a message: one line of at most about so many characters, however large or deep
+    the value."""
     if isinstance(value, str):
         text = repr(value[:length])
     elif isinstance(value, int) and value.bit_length() > 200:  # str() of a longer number is refused, or slow
@@ -248,4 +255,5 @@ _REPR = reprlib.Repr()
 
 
 class UserError(Exception):
-    """A mistake of the user's, told in one sentence (which file, what is wrong, what was expected); printed without a traceback."""
+    """A mistake of the user's, told in one sentence (which file, what is wrong, what was expected); printed without a
+    traceback."""

@@ -8,7 +8,8 @@ import random
 import sys
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads would take the cores from the kernels
+# before torch: spinning threads would take the cores from the kernels
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import pytest

@@ -2,8 +2,9 @@
 
     python docs/simulators/pictures.py NAME FOLDER OUT.jpg
 
-NAME: mujoco, pybullet, sapien, genesis or newton.  FOLDER: has twin.urdf and twin.xml. Without a display MuJoCo wants MUJOCO_GL=egl or
-osmesa, Newton PYGLET_HEADLESS=true, SAPIEN a Vulkan device (a software one does: SwiftShader, Mesa's lavapipe from 24.3 on).
+NAME: mujoco, pybullet, sapien, genesis or newton.  FOLDER: has twin.urdf and twin.xml. Without a display MuJoCo wants
+MUJOCO_GL=egl or osmesa, Newton PYGLET_HEADLESS=true, SAPIEN a Vulkan device (a software one does: SwiftShader, Mesa's
+lavapipe from 24.3 on).
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import numpy as np
 from PIL import Image
 
 WIDTH, HEIGHT = 480, 360
-TARGET, EYE, FIELD = np.array([-0.3, -0.05, 0.0]), np.array([1.45, -1.75, 1.15]), 0.6  # of the demo's cabinet; radians from top to bottom
+# of the demo's cabinet; radians from top to bottom
+TARGET, EYE, FIELD = np.array([-0.3, -0.05, 0.0]), np.array([1.45, -1.75, 1.15]), 0.6
 OPEN = 0.7  # share of the recorded motion
 
 

@@ -1,8 +1,9 @@
-"""``python -m p2gs.bench.basin BENCH_DIR``: up to which opening each setting of a bench like ``bench/basin.yaml`` finds the joint.
+"""``python -m p2gs.bench.basin BENCH_DIR``: up to which opening each setting of a bench like ``bench/basin.yaml`` finds
+the joint.
 
-Scenes are one object at several openings, named NAME_<degrees>. A run succeeds where every joint is found with its type, and axis and
-motion are within a degree. The basin of a setting is the largest opening that two of three of its seeds solve. Writes basin.md, basin.csv
-and, with matplotlib, basin.png into BENCH_DIR/tables.
+Scenes are one object at several openings, named NAME_<degrees>. A run succeeds where every joint is found with its
+type, and axis and motion are within a degree. The basin of a setting is the largest opening that two of three of its
+seeds solve. Writes basin.md, basin.csv and, with matplotlib, basin.png into BENCH_DIR/tables.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ class Outcome:
 
 
 def outcomes(folder: Path | str) -> list[Outcome]:
-    """Every finished run of a bench folder. Raises UserError where it is none, or a scene's name does not end in its opening."""
+    """Every finished run of a bench folder. Raises UserError where it is none, or a scene's name does not end in its
+    opening."""
     folder = Path(folder)
     if not (folder / "cells.json").is_file():
         raise UserError(f"{folder}: has no cells.json: it is no result folder of p2gs bench")
@@ -46,7 +48,9 @@ def outcomes(folder: Path | str) -> list[Outcome]:
         setting, scene, seed = path.parts[-4:-1]
         opening = re.search(r"_(\d+(?:\.\d+)?)$", scene)
         if opening is None:
-            raise UserError(f"{path.parent}: the scene's name '{scene}' does not end in its opening; expected NAME_<degrees>")
+            raise UserError(
+                f"{path.parent}: the scene's name '{scene}' does not end in its opening; expected NAME_<degrees>"
+            )
         joints = json.loads(path.read_text())["joints"]["joints"]
         errors = [j["errors"] for j in joints]
         lost = not errors or any(e is None for e in errors)
@@ -72,7 +76,10 @@ def share(runs: list[Outcome], opening: float) -> tuple[int, int]:
 def markdown(found: list[Outcome]) -> str:
     """Settings down, openings across: successes of how many runs; the basin last."""
     openings = sorted({r.opening for r in found})
-    lines = ["| Start | " + " | ".join(f"{o:g} deg" for o in openings) + " | basin |", "|---|" + "---:|" * (len(openings) + 1)]
+    lines = [
+        "| Start | " + " | ".join(f"{o:g} deg" for o in openings) + " | basin |",
+        "|---|" + "---:|" * (len(openings) + 1),
+    ]
     for setting in dict.fromkeys(r.setting for r in found):
         runs = [r for r in found if r.setting == setting]
         cells = [f"{a} of {n}" if n else "" for a, n in (share(runs, o) for o in openings)]
@@ -82,7 +89,8 @@ def markdown(found: list[Outcome]) -> str:
 
 
 def draw(found: list[Outcome], path: Path) -> bool:
-    """Largest of axis and motion error by opening, a line a setting through its seeds' medians; False without matplotlib."""
+    """Largest of axis and motion error by opening, a line a setting through its seeds' medians; False without
+    matplotlib."""
     from p2gs.bench.plots import lines
 
     series = {}
@@ -90,7 +98,9 @@ def draw(found: list[Outcome], path: Path) -> bool:
         runs = [r for r in found if r.setting == setting]
         points = {}
         for o in sorted({r.opening for r in runs}):
-            errors = sorted(180.0 if r.axis is None or r.motion is None else max(r.axis, r.motion) for r in runs if r.opening == o)
+            errors = sorted(
+                180.0 if r.axis is None or r.motion is None else max(r.axis, r.motion) for r in runs if r.opening == o
+            )
             points[o] = errors[len(errors) // 2]
         series[setting] = points
     return lines(path, series, "opening, degrees", "axis or motion error, degrees (median of seeds)", WITHIN)

@@ -1,7 +1,8 @@
 """One run of a bench: ``p2gs fit``, ``export``, ``test`` as processes of their own, and what became of them.
 
-RUN/cell.json holds {key, status: running|stopped|done|failed, seconds, error, object, setting, seed, parts, words, host}, RUN/bench.log
-what the commands said. A run is done when it has a metrics.json that was not made from another config.
+RUN/cell.json holds {key, status: running|stopped|done|failed, seconds, error, object, setting, seed, parts, words,
+host}, RUN/bench.log what the commands said. A run is done when it has a metrics.json that was not made from another
+config.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from typing import Iterator, Optional, Sequence
 from p2gs.bench.plan import Cell
 
 PROGRAM = (sys.executable, "-m", "p2gs")
-OWN = ("finish",)  # stages whose files beside the checkpoint are the run's own: never taken over from another setting's run
+# stages whose files beside the checkpoint are the run's own: never taken over from another setting's run
+OWN = ("finish",)
 
 
 _children: set[subprocess.Popen] = set()
@@ -119,7 +121,8 @@ def stop_all() -> None:
 
 
 def execute(program: Sequence[str], words: list[str], cell: Cell, log, lock: int, began: float) -> Optional[str]:
-    """Run one command with its output in the log; None, or why it failed in one sentence. Raises Stopped after ``stop_all``."""
+    """Run one command with its output in the log; None, or why it failed in one sentence. Raises Stopped after
+    ``stop_all``."""
     log.write(f"$ p2gs {shlex.join(words)}\n".encode())
     log.flush()
     at = log.tell()
@@ -128,7 +131,9 @@ def execute(program: Sequence[str], words: list[str], cell: Cell, log, lock: int
         environment["OMP_NUM_THREADS"] = str(cell.threads)
     # the lock is inherited: a process that outlives a killed bench keeps others out of its run folder
     command = [*program, *words]
-    child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, env=environment, pass_fds=(lock,))
+    child = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, env=environment, pass_fds=(lock,)
+    )
     left = None if cell.timeout_minutes is None else max(cell.timeout_minutes * 60 - (time.monotonic() - began), 0.01)
     _children.add(child)
     try:
@@ -184,7 +189,9 @@ def is_finished(run: Path) -> bool:
 
 def note(cell: Cell, **values) -> None:
     """Write RUN/cell.json."""
-    kept = {k: v for k, v in dataclasses.asdict(cell).items() if k in ("key", "object", "setting", "seed", "parts", "words")}
+    kept = {
+        k: v for k, v in dataclasses.asdict(cell).items() if k in ("key", "object", "setting", "seed", "parts", "words")
+    }
     path = Path(cell.run) / "cell.json"
     part = path.with_suffix(".part")
     part.write_text(json.dumps({**kept, "host": socket.gethostname(), "time": time.time(), **values}, indent=1) + "\n")

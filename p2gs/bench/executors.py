@@ -1,4 +1,5 @@
-"""Where the runs of a bench are carried out: processes of this machine, SLURM jobs (submitit) or a Ray cluster. One key chooses."""
+"""Where the runs of a bench are carried out: processes of this machine, SLURM jobs (submitit) or a Ray cluster. One key
+chooses."""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ def cores() -> int:
 
 
 def executor(options: BenchOptions, work: Work) -> Executor:
-    """The executor that the options name. work: carries out one run. Raises UserError where its library is not installed."""
+    """The executor that the options name. work: carries out one run. Raises UserError where its library is not
+    installed."""
     if options.executor == "slurm":
         from p2gs.bench.slurm import SlurmExecutor
 

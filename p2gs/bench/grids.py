@@ -14,8 +14,10 @@ OURS = "p2gs"
 
 @dataclass
 class Entry:
-    """One number. text: instead of a number ("-": not defined, "F": nothing right, "": not run).  lost: joints not found, of how many.
-    std: None where there is one run or none is printed.  notes: numbers of footnotes.  best: least (or largest) of its metric and object.
+    """One number. text: instead of a number ("-": not defined, "F": nothing right, "": not run).  lost: joints not
+    found, of how many.
+    std: None where there is one run or none is printed.  notes: numbers of footnotes.  best: least (or largest) of its
+    metric and object.
     """
 
     metric: str
@@ -45,7 +47,8 @@ class Row:
 
 @dataclass
 class Grid:
-    """A table. heads: titles of the label columns.  columns: titles of the entries'.  footnotes: sentences by number."""
+    """A table. heads: titles of the label columns.  columns: titles of the entries'.  footnotes: sentences by
+    number."""
 
     name: str
     title: str
@@ -56,7 +59,8 @@ class Grid:
 
 
 class Filled:
-    """A paper table and a bench's results, by (row label, object, metric). objects: columns of the paper, then those it does not have."""
+    """A paper table and a bench's results, by (row label, object, metric). objects: columns of the paper, then those it
+    does not have."""
 
     def __init__(self, table: PaperTable, results: Results):
         self.table, self.results = table, results
@@ -72,7 +76,8 @@ class Filled:
         self.foreign = [c for c in own if c not in table.objects]
 
     def lines(self) -> list[tuple[str, str, Callable[[str, str], Entry], str]]:
-        """The method rows in order, (label, key, entry of (object, metric), kind): each row of the paper, ours below it; our own last."""
+        """The method rows in order, (label, key, entry of (object, metric), kind): each row of the paper, ours below
+        it; our own last."""
         out = []
         for row in self.table.rows:
             out.append((row, row, lambda o, m, r=row: self.paper(r, o, m), "paper"))
@@ -97,7 +102,9 @@ class Filled:
         if p.value is None:
             return Entry(metric, object, text=p.text, notes=notes)
         digits = len(p.text.partition(".")[2]) - METRICS[metric].digits
-        return Entry(metric, object, p.value, p.std, 1 if p.std is None else PUBLISHED_RUNS, notes=notes, extra_digits=digits)
+        return Entry(
+            metric, object, p.value, p.std, 1 if p.std is None else PUBLISHED_RUNS, notes=notes, extra_digits=digits
+        )
 
     def mine(self, setting: str, object: str, metric: str) -> Entry:
         return summarize(self.runs.get((setting, object), []), object, metric)
@@ -149,6 +156,8 @@ def mark_best(rows: Sequence[Row]) -> None:
             e.best = round(e.mean, e.digits) == best
 
 
+#
+#
 # -- layouts -----------------------------------------------------------------------------------------------------------------------
 
 
@@ -161,7 +170,9 @@ def fill(table: PaperTable, results: Results) -> list[Grid]:
     ours.rows = [r for r in ours.rows if r.kind != "paper"]
     for row in ours.rows:
         row.labels = [label.removesuffix(f" ({OURS})") for label in row.labels]
-    paper = _grid(Filled(table, Results(results.name, [], [], [], [], {})), table.objects, [], table.title + ": as published")
+    paper = _grid(
+        Filled(table, Results(results.name, [], [], [], [], {})), table.objects, [], table.title + ": as published"
+    )
     return [ours, paper]
 
 
@@ -171,7 +182,9 @@ def preset_of(results: Results) -> str:
 
 
 def _grid(filled: Filled, published: Sequence[str], foreign: Sequence[str], title: str) -> Grid:
-    make = {"objects": _objects, "metrics": _metrics, "groups": _groups, "settings": _settings, "average": _average}[filled.table.layout]
+    make = {"objects": _objects, "metrics": _metrics, "groups": _groups, "settings": _settings, "average": _average}[
+        filled.table.layout
+    ]
     heads, columns, rows = make(filled, [*published, *foreign])
     mark_best(rows)
     numbers = {old: new for new, old in enumerate(sorted(filled.used), 1)}
@@ -193,7 +206,8 @@ def _objects(f: Filled, objects: Sequence[str]):
     blocks = f.table.blocks or (tuple(f.table.metrics),)
     columns, rows = list(objects), []
     stacked = [[row for metric in block for row in _metric_rows(f, metric, objects)] for block in blocks]
-    if len(blocks) == 1 or len({len(s) for s in stacked}) > 1:  # sampling floors make the second block longer: one below the other
+    # sampling floors make the second block longer: one below the other
+    if len(blocks) == 1 or len({len(s) for s in stacked}) > 1:
         return ["Metric", "Method"], columns, [row for s in stacked for row in s]
     columns = [*objects, "Metric", *objects]
     for left, right in zip(*stacked, strict=True):
@@ -207,17 +221,24 @@ def _metrics(f: Filled, objects: Sequence[str]):
     for o in objects:
         rows += [Row([o, label], [entry(o, m) for m in metrics], kind) for label, _, entry, kind in f.lines()]
         if any(f.has_floor([o], m) for m in metrics):
-            rows.append(Row([o, "sampling floor"], [f.floor(o, m) if m in CHAMFER else Entry(m, o) for m in metrics], "floor"))
+            rows.append(
+                Row([o, "sampling floor"], [f.floor(o, m) if m in CHAMFER else Entry(m, o) for m in metrics], "floor")
+            )
     return ["Object", "Method"], [METRICS[m].title for m in metrics], rows
 
 
 def _groups(f: Filled, objects: Sequence[str]):
-    """Objects by group, an average below each; what the paper does not have is grouped by the joints that its runs were scored on."""
+    """Objects by group, an average below each; what the paper does not have is grouped by the joints that its runs were
+    scored on."""
     metrics, rows = f.table.metrics, []
     slides = {run.column: run.slides_only for run in f.results.runs if run.values}
     for group in f.table.rows:
         members = [o for o in objects if (group, o, metrics[0]) in f.table.numbers and o != "average"]
-        members += [o for o in objects if o in f.foreign and o not in members and slides.get(o, False) == (group == "Translation")]
+        members += [
+            o
+            for o in objects
+            if o in f.foreign and o not in members and slides.get(o, False) == (group == "Translation")
+        ]
         ours: list[list[Entry]] = []
         for o in members:
             if (group, o, metrics[0]) in f.table.numbers:
@@ -227,7 +248,9 @@ def _groups(f: Filled, objects: Sequence[str]):
                     ours.append([f.mine(setting, o, m) for m in metrics])
                     rows.append(Row([group, f"{o}, {OURS}"], ours[-1], "ours"))
         if "average" in objects:
-            rows.append(Row([group, "Average, paper"], [_keyed(f.paper(group, "average", m), group) for m in metrics], "paper"))
+            rows.append(
+                Row([group, "Average, paper"], [_keyed(f.paper(group, "average", m), group) for m in metrics], "paper")
+            )
         if ours:
             means = [average([e[i] for e in ours], m, f"average {group}") for i, m in enumerate(metrics)]
             rows.append(Row([group, f"Average, {OURS}"], means, "ours"))
@@ -259,6 +282,8 @@ def _average(f: Filled, objects: Sequence[str]):
     metrics, rows = f.table.metrics, []
     every = [*dict.fromkeys(column for _, column in f.runs)]
     for label, _, entry, kind in f.lines():
-        entries = [entry("average", m) if kind == "paper" else average([entry(o, m) for o in every], m) for m in metrics]
+        entries = [
+            entry("average", m) if kind == "paper" else average([entry(o, m) for o in every], m) for m in metrics
+        ]
         rows.append(Row([label, "the paper's objects" if kind == "paper" else f"{len(every)} objects"], entries, kind))
     return ["Setting", "Average over"], [METRICS[m].title for m in metrics], rows

@@ -1,7 +1,7 @@
 """``p2gs bench kernels``: how long a training step and its parts take, beside the reference rasterizer in the same run.
 
-The scene is ``bench.scene``. One thread is timed in CPU time of the process, which other programs on the machine disturb little;
-several threads and CUDA in wall time. All figures are minima over repetitions.
+The scene is ``bench.scene``. One thread is timed in CPU time of the process, which other programs on the machine
+disturb little; several threads and CUDA in wall time. All figures are minima over repetitions.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ REFERENCE_LIMIT = 20_000 * 400 * 400  # Gaussians times pixels: beyond it the re
 
 @dataclass
 class Row:
-    """Milliseconds; None where not measured. rel_grad_err: against the reference in float64, the worst of all inputs (L2, relative)."""
+    """Milliseconds; None where not measured. rel_grad_err: against the reference in float64, the worst of all inputs
+    (L2, relative)."""
 
     device: str
     backend: str
@@ -60,7 +61,9 @@ def _clock(device: str, threads: int) -> Callable[[], float]:
     return time.process_time if threads == 1 else time.perf_counter
 
 
-def _minima(run: Callable[[Callable[[], float]], list[float]], clock: Callable[[], float], seconds: float, least: int) -> list[float]:
+def _minima(
+    run: Callable[[Callable[[], float]], list[float]], clock: Callable[[], float], seconds: float, least: int
+) -> list[float]:
     """``run`` returns the moments between its parts; the least duration of each part over repetitions, in ms."""
     best: list[float] = []
     end, repetitions = time.perf_counter() + seconds, 0
@@ -139,26 +142,35 @@ def _time(n: int, px: int, threads: int, device: str, backend: str, seconds: flo
 
 
 def gradient_error(n: int, px: int, device: str, backend: str) -> float:
-    """Worst relative L2 error of a gradient (of a random linear function of colour, alpha and depth) against float64."""
+    """Worst relative L2 error of a gradient (of a random linear function of colour, alpha and depth) against
+    float64."""
     gradients = []
     for name, dtype in ((backend, torch.float32), ("torch_ref", torch.float64)):
         leaves, camera = _leaves(n, px, device, dtype)
         out = _render(leaves, camera, name)
         g = torch.Generator().manual_seed(0)
-        directions = [torch.randn(t.shape, generator=g, dtype=torch.float64).to(t) for t in (out.colour, out.alpha, out.depth)]
+        directions = [
+            torch.randn(t.shape, generator=g, dtype=torch.float64).to(t) for t in (out.colour, out.alpha, out.depth)
+        ]
         gradients.append(torch.autograd.grad((out.colour, out.alpha, out.depth), leaves, directions))
     return max(float((a.double() - b).norm() / b.norm()) for a, b in zip(*gradients, strict=True))
 
 
-def bench_kernels(device: str = "cpu", json_path: Optional[str] = None, quick: bool = False, all_isas: bool = False) -> list[Row]:
+def bench_kernels(
+    device: str = "cpu", json_path: Optional[str] = None, quick: bool = False, all_isas: bool = False
+) -> list[Row]:
     """Measure, print a table, write the rows as JSON where a path is given, and return them.
 
     json_path: a file, or "-" for standard output (the table then goes to standard error).
-    device: "cpu" (one and all threads, against ``torch_ref``) or "cuda".  quick: fewer sizes and repetitions, under a minute.
-    all_isas: every instruction set that this machine runs instead of the one in use.  Raises UserError when there is nothing to time.
+    device: "cpu" (one and all threads, against ``torch_ref``) or "cuda".  quick: fewer sizes and repetitions, under a
+    minute.
+    all_isas: every instruction set that this machine runs instead of the one in use.  Raises UserError when there is
+    nothing to time.
     """
     if device == "cpu" and native is None:
-        raise UserError("bench kernels: p2gs was installed without its native kernels, there is nothing to time on the CPU")
+        raise UserError(
+            "bench kernels: p2gs was installed without its native kernels, there is nothing to time on the CPU"
+        )
     if device != "cpu" and not torch.cuda.is_available():
         raise UserError(f"bench kernels: no CUDA device for --device {device}")
     before_threads, before_isa = torch.get_num_threads(), native.isa() if native is not None else None
@@ -217,7 +229,9 @@ def _print(rows: list[Row], to_stderr: bool = False) -> None:
 
 def main(words: list[str]) -> int:
     """``p2gs bench kernels``: the arguments behind these words; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="p2gs bench kernels", description="Time the rasterizer and the training step on this machine.")
+    parser = argparse.ArgumentParser(
+        prog="p2gs bench kernels", description="Time the rasterizer and the training step on this machine."
+    )
     parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
     where = "also write the rows there, or to standard output"
     parser.add_argument("--json", dest="json_path", nargs="?", const="-", metavar="FILE", help=where)

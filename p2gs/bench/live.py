@@ -35,7 +35,10 @@ class Display:
         self.errors: list[tuple[str, str]] = []
         self.began: dict[str, float] = {}
         before = sum(s == "done" for s in known.values())
-        print(f"{self.bench.options.name}: {len(known)} runs, {before} done before; results in {self.bench.options.folder}", flush=True)
+        print(
+            f"{self.bench.options.name}: {len(known)} runs, {before} done before; results in {self.bench.options.folder}",
+            flush=True,
+        )
         if not self.terminal:
             yield
             print(self.summary(), flush=True)
@@ -64,13 +67,17 @@ class Display:
             what = f"FAILED: {outcome.error}" if outcome.error else "done"
             left = self.left()
             rest = "" if left is None or left == 0 else f", about {duration(left)} left"
-            print(f"[{self.finished()}/{len(self.known)}] {cell.name}: {what} in {duration(outcome.seconds)}{rest}", flush=True)
+            print(
+                f"[{self.finished()}/{len(self.known)}] {cell.name}: {what} in {duration(outcome.seconds)}{rest}",
+                flush=True,
+            )
 
     def finished(self) -> int:
         return sum(s in ("done", "failed") for s in self.known.values())
 
     def left(self) -> Optional[float]:
-        """Seconds to go: the runs to come at the mean length of those that ended, less what the running ones have behind them."""
+        """Seconds to go: the runs to come at the mean length of those that ended, less what the running ones have
+        behind them."""
         times = self.seconds
         if not times:  # nothing yet in this sitting: what the records say
             times = [read_record(c.run).get("seconds", 0.0) for c in self.bench.cells if self.known[c.name] == "done"]
@@ -78,7 +85,9 @@ class Display:
             return None
         mean, now = sum(times) / len(times), time.monotonic()
         todo = sum(s == "todo" for s in self.known.values()) * mean
-        running = [max(mean - (now - self.began[n]), 0.0) for n, s in self.known.items() if s == "running" and n in self.began]
+        running = [
+            max(mean - (now - self.began[n]), 0.0) for n, s in self.known.items() if s == "running" and n in self.began
+        ]
         return max((todo + sum(running)) / self.slots, max(running, default=0.0))
 
     def refresh(self) -> None:
@@ -105,7 +114,9 @@ class Display:
         left = self.left()
         rest = "time left not known yet" if left is None else f"about {duration(left)} left"
         lines = [Text(f"{self.finished()}/{len(self.known)} runs, {rest}")]
-        lines += [Text(f"{name}: {error}", "red", no_wrap=True, overflow="ellipsis") for name, error in self.errors[-5:]]
+        lines += [
+            Text(f"{name}: {error}", "red", no_wrap=True, overflow="ellipsis") for name, error in self.errors[-5:]
+        ]
         return Group(table, *lines)
 
     def summary(self) -> str:

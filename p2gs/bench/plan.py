@@ -3,9 +3,9 @@
 name: paris                        # result folder runs/bench/<name> unless out says otherwise
 tables: [main_result]              # tables of the paper to fill (names of p2gs/bench/data/published/*.csv)
 root: data                         # the tree that holds the objects' folders; --root DIR
-objects: [paris]                   # benchmarks, object ids or names of scene folders below root; null: every scene folder
-config: [preset/cpu.yaml]          # laid under every run; --preset paper_literal takes that preset instead of the one named here
-settings:                          # name -> what it changes
+objects: [paris]                   # benchmarks, object ids or names of scene folders below root; null: every scene
+folder config: [preset/cpu.yaml]          # laid under every run; --preset paper_literal takes that preset instead of
+the one named here settings:                          # name -> what it changes
   full: {}
   no_repel: {config: [ablation/no_repel.yaml]}
   k_plus_2: {num_parts: gt+2}      # relative to the object's true number of parts
@@ -31,8 +31,10 @@ GT = re.compile(r"gt\s*(?:([+-])\s*(\d+))?")
 
 @dataclass
 class Setting:
-    """One row of a matrix. config: files laid on the bench's.  set: single options, ``{phases.articulation.steps: 500}``.
-    num_parts: a number, auto, or gt, gt+2, gt-1 (relative to the true number, static base counted); null: as the config says.
+    """One row of a matrix. config: files laid on the bench's.  set: single options, ``{phases.articulation.steps:
+    500}``.
+    num_parts: a number, auto, or gt, gt+2, gt-1 (relative to the true number, static base counted); null: as the config
+    says.
     """
 
     config: list[str] = field(default_factory=list)
@@ -42,7 +44,8 @@ class Setting:
 
 @dataclass
 class SlurmOptions:
-    """For executor: slurm. cluster: slurm, or submitit's local and debug executors.  jobs: at most so many at once (job array).
+    """For executor: slurm. cluster: slurm, or submitit's local and debug executors.  jobs: at most so many at once (job
+    array).
     extra: further options of submitit, such as {slurm_partition: gpu, slurm_account: me}.
     """
 
@@ -57,7 +60,8 @@ class SlurmOptions:
 
 @dataclass
 class RayOptions:
-    """For executor: ray. address: of a running cluster, or null to start one on this machine.  cpus, gpus: of one run."""
+    """For executor: ray. address: of a running cluster, or null to start one on this machine.  cpus, gpus: of one
+    run."""
 
     address: Optional[str] = None
     cpus: float = 2
@@ -66,14 +70,16 @@ class RayOptions:
 
 @dataclass
 class BenchOptions:
-    """Options of a bench beside its settings; see the module. export: formats written between fit and test (meshes are scored).
+    """Options of a bench beside its settings; see the module. export: formats written between fit and test (meshes are
+    scored).
 
     format: of a data format of the user's own; every folder right below root is then a scene, named by its folder.
-    preset: taken instead of the presets among ``config``, a name in configs/preset or a file; results go to a folder of their own.
+    preset: taken instead of the presets among ``config``, a name in configs/preset or a file; results go to a folder of
+    their own.
     num_parts: of the settings that say nothing of it (the literal preset finds no number: gt).
-    reuse: a run takes over finished stages of the same object and seed from the settings before it; stages whose config differs are
-    run again, so the results are those of independent runs.  processes: runs at once (local).  threads: of one run, default the
-    cores divided by the processes.  timeout_minutes: a longer run is stopped and counts as failed.
+    reuse: a run takes over finished stages of the same object and seed from the settings before it; stages whose config
+    differs are run again, so the results are those of independent runs.  processes: runs at once (local).  threads: of
+    one run, default the cores divided by the processes.  timeout_minutes: a longer run is stopped and counts as failed.
     """
 
     name: str = "bench"
@@ -142,8 +148,8 @@ class Scene:
 
 @dataclass(frozen=True)
 class Cell:
-    """One run. words: of ``p2gs fit`` without ``--run``.  key: changes with all that decides the result.  donors: run folders that may
-    hold finished stages of the same object and seed.
+    """One run. words: of ``p2gs fit`` without ``--run``.  key: changes with all that decides the result.  donors: run
+    folders that may hold finished stages of the same object and seed.
     """
 
     object: str
@@ -182,7 +188,17 @@ class Bench:
             for scene in self.scenes:
                 parts = resolve_parts(self.parts_of(setting), scene)
                 for seed in o.seeds:
-                    decides = [merged, o.set, setting.set, parts, scene.name, scene.format, scene.source, seed, o.export]
+                    decides = [
+                        merged,
+                        o.set,
+                        setting.set,
+                        parts,
+                        scene.name,
+                        scene.format,
+                        scene.source,
+                        seed,
+                        o.export,
+                    ]
                     key = hashlib.sha256(json.dumps(decides, sort_keys=True, default=str).encode()).hexdigest()[:16]
                     run = str(o.folder / "runs" / name / scene.name / f"seed{seed}")
                     before = donors.setdefault((scene.name, seed), [])
@@ -256,7 +272,9 @@ def resolve_parts(wanted: Optional[Union[int, str]], scene: Scene) -> Optional[s
     if match is None:
         raise UserError(f"num_parts: expected a number, auto, gt or gt+N, got '{wanted}'")
     if scene.parts is None:
-        raise UserError(f"num_parts: {wanted} needs the true number of parts of {scene.name}, which has no ground truth")
+        raise UserError(
+            f"num_parts: {wanted} needs the true number of parts of {scene.name}, which has no ground truth"
+        )
     sign, number = match.groups()
     return str(max(scene.parts + (int(number) if number else 0) * (-1 if sign == "-" else 1), 2))
 
@@ -282,7 +300,9 @@ def find_scenes(options: BenchOptions) -> Iterator[Scene]:
             yield own[name]
             continue
         if name not in known:
-            raise UserError(f"objects: {root} has no scene '{name}', and no benchmark has{suggest(name, [*known, *own])}")
+            raise UserError(
+                f"objects: {root} has no scene '{name}', and no benchmark has{suggest(name, [*known, *own])}"
+            )
         objects = pick_objects([name])
         places = find_objects(root, objects)
         missing += [o.id for o in objects if o.id not in places]
@@ -291,11 +311,14 @@ def find_scenes(options: BenchOptions) -> Iterator[Scene]:
                 where = places[o.id]
                 yield Scene(o.id, o.column, str(where.root), where.format, where.source, o.parts)
     if missing:
-        raise UserError(f"{root}: lacks {', '.join(missing)} (p2gs data prepare {root} says more; --objects names fewer)")
+        raise UserError(
+            f"{root}: lacks {', '.join(missing)} (p2gs data prepare {root} says more; --objects names fewer)"
+        )
 
 
 def own_scenes(root: Path, format: str, objects: Optional[list[str]]) -> Iterator[Scene]:
-    """The folders right below ``root`` (those named by ``objects``), as scenes of a format of the user's own. Raises UserError."""
+    """The folders right below ``root`` (those named by ``objects``), as scenes of a format of the user's own. Raises
+    UserError."""
     folders = {path.name: path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")}
     for name in folders if objects is None else objects:
         if name not in folders:
@@ -319,6 +342,8 @@ def local_scenes(root: Path) -> Iterator[Scene]:
         yield Scene(name, name, str(folder), format, None, None if truth is None else len(truth.joints) + 1)
 
 
+#
+#
 # -- reading -----------------------------------------------------------------------------------------------------------------------
 
 
@@ -330,9 +355,10 @@ def read_bench(
 ) -> Bench:
     """The bench of YAML files (merged in order, ``include`` works).
 
-    words: overrides as on the command line; those that name no option of a bench (``--phases.articulation.steps 100``) go to every fit.
-    objects: instead of the files' (benchmarks, ids, or scene folders below root by name).  settings: of the files', these only.
-    Raises UserError.
+    words: overrides as on the command line; those that name no option of a bench (``--phases.articulation.steps 100``)
+    go to every fit.
+    objects: instead of the files' (benchmarks, ids, or scene folders below root by name).  settings: of the files',
+    these only. Raises UserError.
     """
     keys = {**keys_of(BenchOptions), "settings": None}
     own, for_fit = [], {}

@@ -32,14 +32,18 @@ def plot(path: Path, grids: Sequence[Grid]) -> bool:
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
     bars = max(len(series(grid, metric)) for grid, metric in panels)
-    figure, axes = plt.subplots(rows, columns, figsize=(5.5 * columns, 3.6 * rows + 0.4 + 0.12 * bars), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(5.5 * columns, 3.6 * rows + 0.4 + 0.12 * bars), squeeze=False, layout="constrained"
+    )
     handles = {}
     for axis, (grid, metric) in zip(axes.flat, panels, strict=False):
         draw(axis, grid, metric)
         handles |= {text: handle for handle, text in zip(*axis.get_legend_handles_labels(), strict=True)}
     for axis in list(axes.flat)[len(panels) :]:
         axis.remove()
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 2 * columns), fontsize=8)
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 2 * columns), fontsize=8
+    )
     figure.suptitle(grids[0].title)
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -53,7 +57,9 @@ def series(grid: Grid, metric: str) -> dict[tuple[str, str], dict[str, Entry]]:
         for at, e in enumerate(row.entries):
             if e.metric == metric and e.object and row.kind != "floor" and (e.mean is not None or e.text == "F"):
                 settings = len(grid.heads) == 3  # the layout with the settings across
-                method = f"{row.labels[-1]} {grid.columns[at]}" if settings else row.labels[-1].removeprefix(f"{e.object}, ")
+                method = (
+                    f"{row.labels[-1]} {grid.columns[at]}" if settings else row.labels[-1].removeprefix(f"{e.object}, ")
+                )
                 out.setdefault((method, row.kind), {})[e.object] = e
     return out
 
@@ -82,12 +88,15 @@ def draw(axis, grid: Grid, metric: str) -> None:
     if base:
         axis.set_yscale("log")
         axis.set_ylim(bottom=base)
-    axis.set_title(METRICS[metric].title + (" (higher is better)" if METRICS[metric].higher_is_better else ""), fontsize=10)
+    axis.set_title(
+        METRICS[metric].title + (" (higher is better)" if METRICS[metric].higher_is_better else ""), fontsize=10
+    )
     axis.set_xticks(range(len(objects)), objects, rotation=30, ha="right", fontsize=8)
 
 
 def lines(path: Path, series: dict[str, dict[float, float]], x: str, y: str, mark: float) -> bool:
-    """One line a name through {x: y}, y logarithmic, with a dashed line at ``mark``. False where matplotlib is not installed."""
+    """One line a name through {x: y}, y logarithmic, with a dashed line at ``mark``. False where matplotlib is not
+    installed."""
     try:
         import matplotlib
     except ImportError:

@@ -1,4 +1,5 @@
-"""The paper's tables as data: every number with its table, row, object and metric; footnotes on those that contradict each other."""
+"""The paper's tables as data: every number with its table, row, object and metric; footnotes on those that contradict
+each other."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ DATA = Path(__file__).parent / "data"
 
 @dataclass(frozen=True)
 class Metric:
-    """How a metric is printed. digits: after the point, as the paper has it.  source: of the sampling floor and the failures."""
+    """How a metric is printed. digits: after the point, as the paper has it.  source: of the sampling floor and the
+    failures."""
 
     name: str
     title: str
@@ -47,7 +49,8 @@ CHAMFER = ("cd_static", "cd_movable", "cd_whole")
 
 @dataclass(frozen=True)
 class Published:
-    """One printed number. value: None where the paper prints a dash or F (``text`` says which).  std: None where none is printed."""
+    """One printed number. value: None where the paper prints a dash or F (``text`` says which).  std: None where none
+    is printed."""
 
     row: str
     object: str

@@ -10,7 +10,8 @@ from p2gs.types import UserError
 
 
 class RayExecutor:
-    """One task a run, as many at once as the cluster has room for. The folder of the bench must be the same on every node."""
+    """One task a run, as many at once as the cluster has room for. The folder of the bench must be the same on every
+    node."""
 
     def __init__(self, options: BenchOptions, work):
         try:
@@ -21,9 +22,17 @@ class RayExecutor:
         self.started = not ray.is_initialized()
         if self.started:
             try:
-                ray.init(address=o.address, include_dashboard=False, log_to_driver=False, logging_level="error", configure_logging=False)
+                ray.init(
+                    address=o.address,
+                    include_dashboard=False,
+                    log_to_driver=False,
+                    logging_level="error",
+                    configure_logging=False,
+                )
             except Exception as err:
-                raise UserError(f"ray.address: no cluster at {o.address!r} ({' '.join(str(err).split())[:200]})") from err
+                raise UserError(
+                    f"ray.address: no cluster at {o.address!r} ({' '.join(str(err).split())[:200]})"
+                ) from err
         have = ray.cluster_resources()
         for name, need in (("CPU", o.cpus), ("GPU", o.gpus)):
             if need > have.get(name, 0):

@@ -1,4 +1,5 @@
-"""``p2gs table``: a bench's results as files: the paper's tables, every run, every test, and one page with all of it."""
+"""``p2gs table``: a bench's results as files: the paper's tables, every run, every test, and one page with all of
+it."""
 
 from __future__ import annotations
 
@@ -40,8 +41,9 @@ class Test:
 def write_tables(folder: Path | str, names: Optional[list[str]] = None, out: Optional[Path | str] = None) -> list[Path]:
     """Write the tables of a bench folder to ``out`` (default BENCH/tables); returns the files.
 
-    names: tables of the paper; by default those that the bench names. A summary with all settings and objects is always made.
-    Raises UserError for a folder that is no bench's, an unknown table, or a table none of whose rows the bench has run.
+    names: tables of the paper; by default those that the bench names. A summary with all settings and objects is always
+    made. Raises UserError for a folder that is no bench's, an unknown table, or a table none of whose rows the bench
+    has run.
     """
     results = collect(folder)
     target = Path(out) if out is not None else Path(folder) / "tables"
@@ -54,7 +56,10 @@ def write_tables(folder: Path | str, names: Optional[list[str]] = None, out: Opt
     files, sections, tests = [], [], []
     for name, grids in [("summary", [summary(results)]), *((t.name, fill(t, results)) for t in tables)]:
         text = "\n".join(write.markdown(g) for g in grids)
-        files += [save(target / f"{name}.md", text), save(target / f"{name}.tex", "\n".join(write.latex(g) for g in grids))]
+        files += [
+            save(target / f"{name}.md", text),
+            save(target / f"{name}.tex", "\n".join(write.latex(g) for g in grids)),
+        ]
         write.write_csv(target / f"{name}.csv", grids)
         files.append(target / f"{name}.csv")
         drawn = plots.plot(target / f"{name}.png", grids)
@@ -64,7 +69,15 @@ def write_tables(folder: Path | str, names: Optional[list[str]] = None, out: Opt
         tests += [*against_paper(table, results), *between_settings(table, results)]
     files += [write_runs(target / "runs.csv", results), write_tests(target / "tests.csv", tests)]
     published = [published_section()] if set(PAIRS) & {t.name for t in tables} else []
-    page = "\n".join([head(results), *sections, significance(tests), *published, notes(results, any(p.suffix == ".png" for p in files))])
+    page = "\n".join(
+        [
+            head(results),
+            *sections,
+            significance(tests),
+            *published,
+            notes(results, any(p.suffix == ".png" for p in files)),
+        ]
+    )
     return [save(target / "index.md", page), *files]
 
 
@@ -85,12 +98,20 @@ def summary(results: Results) -> Grid:
         mine = [r for r in results.runs if r.column == column]
         floors = {m: sample([r.floors[m] for r in mine if m in r.floors]) for m in metrics}
         if any(floors.values()):
-            rows.append(Row([column, "sampling floor"], [Entry(m, column, s.mean if (s := floors[m]) else None) for m in metrics], "floor"))
+            rows.append(
+                Row(
+                    [column, "sampling floor"],
+                    [Entry(m, column, s.mean if (s := floors[m]) else None) for m in metrics],
+                    "floor",
+                )
+            )
     mark_best(rows)
     title = f"{results.name}: all runs{preset_of(results)}"
     return Grid("summary", title, ["Object", "Setting"], [METRICS[m].title for m in metrics], rows)
 
 
+#
+#
 # -- tests -------------------------------------------------------------------------------------------------------------------------
 
 
@@ -111,7 +132,9 @@ def against_paper(table: PaperTable, results: Results) -> Iterator[Test]:
                 continue
             result = welch(mine, printed(p.value, p.std, METRICS[p.metric].digits))
             if result is not None:
-                yield Test(table.name, p.object, p.metric, f"p2gs {setting}", p.row, mine, Sample(p.value, p.std, 3), result)
+                yield Test(
+                    table.name, p.object, p.metric, f"p2gs {setting}", p.row, mine, Sample(p.value, p.std, 3), result
+                )
 
 
 def between_settings(table: PaperTable, results: Results) -> Iterator[Test]:
@@ -133,7 +156,25 @@ def write_tests(path: Path, tests: list[Test]) -> Path:
         out.writerow("table object metric a b mean_a std_a n_a mean_b std_b n_b t degrees p verdict".split())
         for x in tests:
             a, b, r = x.sample_a, x.sample_b, x.result
-            out.writerow([x.table, x.object, x.metric, x.a, x.b, a.mean, a.std, a.n, b.mean, b.std, b.n, r.t, r.degrees, r.p, x.verdict])
+            out.writerow(
+                [
+                    x.table,
+                    x.object,
+                    x.metric,
+                    x.a,
+                    x.b,
+                    a.mean,
+                    a.std,
+                    a.n,
+                    b.mean,
+                    b.std,
+                    b.n,
+                    r.t,
+                    r.degrees,
+                    r.p,
+                    x.verdict,
+                ]
+            )
     return path
 
 
@@ -158,6 +199,8 @@ def significance(tests: list[Test]) -> str:
     return "\n".join(lines) + "\n"
 
 
+#
+#
 # -- the page ----------------------------------------------------------------------------------------------------------------------
 
 
@@ -169,7 +212,9 @@ def write_runs(path: Path, results: Results) -> Path:
         out.writerow(["object", "column", "setting", "seed", "status", *metrics, "joints_lost", "joints", "error"])
         for r in results.runs:
             values = ["" if r.values.get(m) is None else r.values[m] for m in metrics]
-            out.writerow([r.object, r.column, r.setting, r.seed, r.status, *values, *r.failed.get("ang", (0, 0)), r.error or ""])
+            out.writerow(
+                [r.object, r.column, r.setting, r.seed, r.status, *values, *r.failed.get("ang", (0, 0)), r.error or ""]
+            )
     return path
 
 
@@ -178,7 +223,9 @@ def head(results: Results) -> str:
     seeds = sorted({r.seed for r in results.runs})
     about = ", ".join(f"{k} {v}" for k, v in results.about.items() if v and k != "command")
     states = ", ".join(f"{n} {status}" for status, n in count.items())
-    return f"# {results.name}\n\n{len(results.runs)} runs ({states}), seeds {', '.join(map(str, seeds))}; p2gs {about}.\n"
+    return (
+        f"# {results.name}\n\n{len(results.runs)} runs ({states}), seeds {', '.join(map(str, seeds))}; p2gs {about}.\n"
+    )
 
 
 def notes(results: Results, plotted: bool) -> str:
@@ -198,5 +245,10 @@ def notes(results: Results, plotted: bool) -> str:
         lines.append("- No plots: matplotlib is not installed.")
     broken = [r for r in results.runs if r.status == "failed"]
     if broken:
-        lines += ["", "## Runs that failed", "", *(f"- {r.object} {r.setting} seed {r.seed}: {r.error}" for r in broken)]
+        lines += [
+            "",
+            "## Runs that failed",
+            "",
+            *(f"- {r.object} {r.setting} seed {r.seed}: {r.error}" for r in broken),
+        ]
     return "\n".join(lines) + "\n"

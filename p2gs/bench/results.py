@@ -17,8 +17,10 @@ JOINT = ("ang", "pos", "motion")
 
 @dataclass
 class Run:
-    """One run. column: the object's name in the paper's tables.  values: by metric, None where there is nothing to score.
-    failed: joints (or parts) not found, of how many.  floors: sampling floors of the Chamfer numbers.  error: of a run that failed.
+    """One run. column: the object's name in the paper's tables.  values: by metric, None where there is nothing to
+    score.
+    failed: joints (or parts) not found, of how many.  floors: sampling floors of the Chamfer numbers.  error: of a run
+    that failed.
     """
 
     object: str
@@ -35,7 +37,8 @@ class Run:
 
 @dataclass
 class Results:
-    """All runs of a bench folder. tables: those the bench names.  about: version, commit and command it was run by, and the presets."""
+    """All runs of a bench folder. tables: those the bench names.  about: version, commit and command it was run by, and
+    the presets."""
 
     name: str
     runs: list[Run]
@@ -55,7 +58,9 @@ def collect(folder: Path | str) -> Results:
     scenes = {s["name"]: s for s in about["scenes"]}
     runs = [read_run(folder / c["run"], c, scenes[c["object"]]) for c in about["cells"]]
     settings = list(dict.fromkeys(c["setting"] for c in about["cells"]))
-    return Results(about["name"], runs, about["tables"], settings, [s["column"] for s in about["scenes"]], made_by(about))
+    return Results(
+        about["name"], runs, about["tables"], settings, [s["column"] for s in about["scenes"]], made_by(about)
+    )
 
 
 def made_by(about: dict) -> dict:
@@ -100,7 +105,9 @@ def read_metrics(run: Run, metrics: dict) -> None:
                 run.floors[name] = entry["floor"]
         run.failed["cd_movable"] = (chamfer["failures"], len(chamfer["parts"]))
     views = (metrics.get("views") or {}).get("mean") or {}
-    run.values |= {name: views.get(key) for name, key in (("psnr", "psnr_white"), ("ssim", "ssim_white"), ("lpips", "lpips"))}
+    run.values |= {
+        name: views.get(key) for name, key in (("psnr", "psnr_white"), ("ssim", "ssim_white"), ("lpips", "lpips"))
+    }
     if joints:
         run.values["extra"] = float(len(joints["extra"]))
     slots = metrics.get("slots")

@@ -22,10 +22,13 @@ from p2gs.provenance import provenance
 POLL = 0.2  # seconds between two looks at the jobs
 
 
-def run_bench(bench: Bench, *, skip_failed: bool = False, program: Sequence[str] = PROGRAM, display: Optional[Display] = None) -> Counter:
+def run_bench(
+    bench: Bench, *, skip_failed: bool = False, program: Sequence[str] = PROGRAM, display: Optional[Display] = None
+) -> Counter:
     """Carry out every run that is not done. Returns how many there are by status (done, failed).
 
-    skip_failed: leave runs alone that failed before; otherwise they are tried again.  program: the words before ``fit ...``.
+    skip_failed: leave runs alone that failed before; otherwise they are tried again.  program: the words before ``fit
+    ...``.
     """
     folder = bench.options.folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -77,10 +80,20 @@ def save_bench(bench: Bench) -> None:
     """OUT/bench.yaml, which runs the same bench again, and OUT/cells.json, which ``p2gs table`` reads."""
     folder = bench.options.folder
     (folder / "bench.yaml").write_text(to_yaml({**bench.tree, "out": str(folder)}), encoding="utf-8")
-    cells = [{"object": c.object, "setting": c.setting, "seed": c.seed, "run": str(Path(c.run).relative_to(folder))} for c in bench.cells]
+    cells = [
+        {"object": c.object, "setting": c.setting, "seed": c.seed, "run": str(Path(c.run).relative_to(folder))}
+        for c in bench.cells
+    ]
     scenes = [{"name": s.name, "column": s.column, "parts": s.parts} for s in bench.scenes]
     o = bench.options
-    about = {"p2gs": provenance(), "presets": o.presets, "name": o.name, "tables": o.tables, "scenes": scenes, "cells": cells}
+    about = {
+        "p2gs": provenance(),
+        "presets": o.presets,
+        "name": o.name,
+        "tables": o.tables,
+        "scenes": scenes,
+        "cells": cells,
+    }
     (folder / "cells.json").write_text(json.dumps(about, indent=1) + "\n")
 
 

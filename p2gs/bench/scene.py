@@ -1,4 +1,5 @@
-"""The scene that the kernel benchmarks render: N Gaussians on the surfaces of boxes and cylinders, one camera around it."""
+"""The scene that the kernel benchmarks render: N Gaussians on the surfaces of boxes and cylinders, one camera around
+it."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from p2gs.types import Camera
 
 @dataclass
 class BenchScene:
-    """Arguments of ``render.rasterize`` (activated values, float32): means, scales [N, 3], quats [N, 4], opacities [N], sh [N, 16, 3]."""
+    """Arguments of ``render.rasterize`` (activated values, float32): means, scales [N, 3], quats [N, 4], opacities [N],
+    sh [N, 16, 3]."""
 
     means: Tensor
     quats: Tensor
@@ -29,7 +31,11 @@ class BenchScene:
 
 
 # A cupboard, more or less: (centre, half size) of boxes, (centre, radius, half height) of upright cylinders.
-_BOXES = (((0, 0, 0), (0.7, 0.45, 0.55)), ((0.15, -0.55, 0.25), (0.4, 0.1, 0.14)), ((-0.35, -0.5, -0.3), (0.25, 0.06, 0.2)))
+_BOXES = (
+    ((0, 0, 0), (0.7, 0.45, 0.55)),
+    ((0.15, -0.55, 0.25), (0.4, 0.1, 0.14)),
+    ((-0.35, -0.5, -0.3), (0.25, 0.06, 0.2)),
+)
 _CYLINDERS = (((-0.4, 0.1, 0.75), 0.18, 0.2), ((0.35, 0.0, 0.7), 0.12, 0.15), ((0.15, -0.7, 0.25), 0.05, 0.12))
 
 
@@ -61,8 +67,8 @@ def _surface_samples(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def bench_scene(n: int, px: int, seed: int = 0, scale: float = 2.0) -> BenchScene:
-    """n Gaussians of about ``scale`` x the mean nearest-neighbour distance (lognormal, sigma 0.3, each axis), opacities 0.1 to 0.95,
-    random rotations and degree-3 colours; a view of px x px pixels of which they cover about 40 %."""
+    """n Gaussians of about ``scale`` x the mean nearest-neighbour distance (lognormal, sigma 0.3, each axis), opacities
+    0.1 to 0.95, random rotations and degree-3 colours; a view of px x px pixels of which they cover about 40 %."""
     rng = np.random.default_rng(seed)
     means = _surface_samples(n, rng)
     spacing = search_tree(means).query(means, 2)[0][:, 1].mean() if n > 1 else 0.1
@@ -83,4 +89,6 @@ def bench_scene(n: int, px: int, seed: int = 0, scale: float = 2.0) -> BenchScen
         return torch.tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
     camera = Camera(f32(viewmat), f32(K), px, px)
-    return BenchScene(f32(means), f32(rng.normal(size=(n, 4))), f32(scales), f32(rng.uniform(0.1, 0.95, n)), f32(sh), camera)
+    return BenchScene(
+        f32(means), f32(rng.normal(size=(n, 4))), f32(scales), f32(rng.uniform(0.1, 0.95, n)), f32(sh), camera
+    )

@@ -1,8 +1,10 @@
-"""The paper's own significance count, taken again: Part2GS against ArtGS over every object and metric that it prints for both.
+"""The paper's own significance count, taken again: Part2GS against ArtGS over every object and metric that it prints
+for both.
 
-The paper (section 4.1): t-tests, n = 3, "a small epsilon (1e-6)", 111 object-metric pairs, of which 83 better, 25 without a significant
-difference, 3 worse. Its tables print means, and spreads on PARIS only, so the count can be taken from them in two ways: with spreads as
-they are printed (at least the epsilon), or with what rounding to two digits leaves open (half the last digit at least).
+The paper (section 4.1): t-tests, n = 3, "a small epsilon (1e-6)", 111 object-metric pairs, of which 83 better, 25
+without a significant difference, 3 worse. Its tables print means, and spreads on PARIS only, so the count can be taken
+from them in two ways: with spreads as they are printed (at least the epsilon), or with what rounding to two digits
+leaves open (half the last digit at least).
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ Spread = Literal["printed", "rounding"]
 def published_verdicts(spread: Spread) -> Iterator[tuple[str, str, str, str]]:
     """(table, object, metric, verdict of Part2GS against ArtGS) by Welch's test at p < 0.05, n = 3 on both sides.
 
-    spread: "printed" takes a missing or zero spread as the paper's epsilon of 1e-6; "rounding" as half the last printed digit.
+    spread: "printed" takes a missing or zero spread as the paper's epsilon of 1e-6; "rounding" as half the last printed
+    digit.
     """
     for name in PAIRS:
         table = paper_table(name)

@@ -12,7 +12,8 @@ from p2gs.types import UserError
 class SlurmExecutor:
     """One job a run. The folder of the bench and the environment must be the same on every node.
 
-    Killing the bench leaves the jobs in the queue; starting it again finds what they finished and waits for those that still run.
+    Killing the bench leaves the jobs in the queue; starting it again finds what they finished and waits for those that
+    still run.
     """
 
     def __init__(self, options: BenchOptions, work):

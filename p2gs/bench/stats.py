@@ -34,7 +34,8 @@ def sample(values: Sequence[float]) -> Optional[Sample]:
 
 
 def printed(mean: float, std: float, digits: int = 2, n: int = PUBLISHED_RUNS) -> Sample:
-    """A number as a table prints it: a spread that reads 0.00 may be anything below half its last digit, and is taken as that."""
+    """A number as a table prints it: a spread that reads 0.00 may be anything below half its last digit, and is taken
+    as that."""
     return Sample(mean, max(std, 0.5 * 10**-digits), n)
 
 

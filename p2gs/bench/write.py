@@ -41,7 +41,15 @@ def latex_entry(e: Entry) -> str:
 
 def escape(text: str) -> str:
     """For LaTeX text."""
-    for a, b in (("\\", "\\textbackslash{}"), ("&", "\\&"), ("%", "\\%"), ("_", "\\_"), ("#", "\\#"), ("$", "\\$"), ("±", "$\\pm$")):
+    for a, b in (
+        ("\\", "\\textbackslash{}"),
+        ("&", "\\&"),
+        ("%", "\\%"),
+        ("_", "\\_"),
+        ("#", "\\#"),
+        ("$", "\\$"),
+        ("±", "$\\pm$"),
+    ):
         text = text.replace(a, b)
     return text
 
@@ -58,7 +66,12 @@ def labels(rows: Sequence[Row], cell: Callable[[str], str]) -> list[list[str]]:
 def markdown(grid: Grid) -> str:
     """A Markdown table with its title and footnotes."""
     heads = [*grid.heads, *grid.columns]
-    lines = [f"**{grid.title}**", "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(grid.heads) + "---:|" * len(grid.columns)]
+    lines = [
+        f"**{grid.title}**",
+        "",
+        "| " + " | ".join(heads) + " |",
+        "|" + "---|" * len(grid.heads) + "---:|" * len(grid.columns),
+    ]
     for names, row in zip(labels(grid.rows, str), grid.rows, strict=True):
         style = (lambda t: f"*{t}*" if t else "") if row.kind == "floor" else str
         lines.append("| " + " | ".join([*map(style, names), *(style(markdown_entry(e)) for e in row.entries)]) + " |")
@@ -103,10 +116,23 @@ def write_csv(path: Path, grids: Sequence[Grid]) -> None:
     """Every number in full, one a line."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         out = csv.writer(file, lineterminator="\n")
-        out.writerow(["table", "row", "source", "object", "metric", "mean", "std", "n", "text", "joints_lost", "joints", "best"])
+        out.writerow(
+            ["table", "row", "source", "object", "metric", "mean", "std", "n", "text", "joints_lost", "joints", "best"]
+        )
         for grid in grids:
             for row in grid.rows:
                 for e in row.entries:
                     if e.mean is not None or (e.text and e.object):
-                        values = [" / ".join(row.labels), row.kind, e.object, e.metric, e.mean, e.std, e.n, e.text, *e.lost, int(e.best)]
+                        values = [
+                            " / ".join(row.labels),
+                            row.kind,
+                            e.object,
+                            e.metric,
+                            e.mean,
+                            e.std,
+                            e.n,
+                            e.text,
+                            *e.lost,
+                            int(e.best),
+                        ]
                         out.writerow([grid.name, *("" if v is None else v for v in values)])

@@ -33,18 +33,21 @@ CALLBACKS: Registry[type["Callback"]] = Registry("callback")
 class Callback(LightningCallback):
     """Base of every callback: all hooks of Lightning, and ``on_step`` after each optimiser step.
 
-    A phase offers ``phase_name``, ``step`` (steps done), ``total_steps``, ``scalars`` (name -> detached Tensor or float; call
-    ``.item()`` only when logging), ``num_gaussians``, ``preview(times)`` (name -> uint8 [H, W, 3]), ``summary()`` (name -> float).
+    A phase offers ``phase_name``, ``step`` (steps done), ``total_steps``, ``scalars`` (name -> detached Tensor or
+    float; call ``.item()`` only when logging), ``num_gaussians``, ``preview(times)`` (name -> uint8 [H, W, 3]),
+    ``summary()`` (name -> float).
 
     changes_result: whether the twin depends on it. A phase runs again when such a callback's options change; callbacks
-    that only watch say False.  alone: with it only one phase trains at a time (else both single states may, each in a process).
+    that only watch say False.  alone: with it only one phase trains at a time (else both single states may, each in a
+    process).
     """
 
     changes_result: ClassVar[bool] = True
     alone: ClassVar[bool] = False
 
     def prepare(self, cfg, scene) -> None:
-        """Before a phase's training. cfg: the run's RunConfig.  scene: the TwoStateScene as trained on (internal units)."""
+        """Before a phase's training. cfg: the run's RunConfig.  scene: the TwoStateScene as trained on (internal
+        units)."""
 
     def on_step(self, trainer, phase) -> None:
         """After an optimiser step; ``phase.step`` counts it already."""
@@ -68,7 +71,8 @@ def run_folder(trainer) -> Path:
 
 
 def due(step: int, every: int, total: int) -> bool:
-    """Whether something done every ``every`` steps is due after ``step`` steps: at multiples, and at the end. every 0: at the end only."""
+    """Whether something done every ``every`` steps is due after ``step`` steps: at multiples, and at the end. every 0:
+    at the end only."""
     return step == total or (every > 0 and step > 0 and step % every == 0)
 
 

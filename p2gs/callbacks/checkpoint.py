@@ -17,7 +17,8 @@ def checkpoint_path(run_dir: Path, phase_name: str) -> Path:
 
 
 def save_atomically(trainer, path: Path) -> None:
-    """``trainer.save_checkpoint`` beside ``path``, sealed and flushed to disk, then renamed: a kill leaves the old file or the new one."""
+    """``trainer.save_checkpoint`` beside ``path``, sealed and flushed to disk, then renamed: a kill leaves the old file
+    or the new one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     trainer.save_checkpoint(part)
@@ -26,8 +27,8 @@ def save_atomically(trainer, path: Path) -> None:
 
 @register_callback("checkpoint")
 class Checkpoint(Callback):
-    """every: steps between two checkpoints, each replacing the one before; the last step is always saved, and so is the last good one when
-    a loss stops being finite or the scheduler ends the process (SIGTERM)."""
+    """every: steps between two checkpoints, each replacing the one before; the last step is always saved, and so is the
+    last good one when a loss stops being finite or the scheduler ends the process (SIGTERM)."""
 
     changes_result = False
     every: int = 500
@@ -37,6 +38,7 @@ class Checkpoint(Callback):
             save_atomically(trainer, checkpoint_path(run_folder(trainer), phase.phase_name))
 
     def on_exception(self, trainer, phase, exception) -> None:
-        """Both come between two steps, when parameters and optimiser agree; an interrupt or a mistake elsewhere may come amid one."""
+        """Both come between two steps, when parameters and optimiser agree; an interrupt or a mistake elsewhere may
+        come amid one."""
         if isinstance(exception, (LossNotFinite, SIGTERMException)) and phase.step > 0 and all_finite(phase):
             save_atomically(trainer, checkpoint_path(run_folder(trainer), phase.phase_name))

@@ -11,12 +11,13 @@ from p2gs.types import UserError
 
 @register_callback("densify")
 class Densify(Callback):
-    """budget: Gaussians aimed at, or null for as many as ``threshold`` lets grow.  every: steps between two calls.  start, stop: fractions
-    of the phase; the aim rises linearly from the present count to the budget over three quarters of this span.
+    """budget: Gaussians aimed at, or null for as many as ``threshold`` lets grow.  every: steps between two calls.
+    start, stop: fractions of the phase; the aim rises linearly from the present count to the budget over three quarters
+    of this span.
     min_opacity, max_scale: what is fainter or larger (internal units) goes.
-    split_scale: what is larger is split, the rest cloned.  threshold: above 0, what has a larger mean screen gradient grows, as in 3DGS
-    (per half the image's height; the budget, where there is one, is a cap then).  reset_every: steps after which opacities are cut
-    to ``reset_to`` while Gaussians grow (3DGS: 3,000 and 0.01; 0 = never)."""
+    split_scale: what is larger is split, the rest cloned.  threshold: above 0, what has a larger mean screen gradient
+    grows, as in 3DGS (per half the image's height; the budget, where there is one, is a cap then).  reset_every: steps
+    after which opacities are cut to ``reset_to`` while Gaussians grow (3DGS: 3,000 and 0.01; 0 = never)."""
 
     budget: Optional[int] = 20000
     every: int = 100
@@ -31,7 +32,9 @@ class Densify(Callback):
 
     def __post_init__(self):
         if self.budget is None and self.threshold <= 0:
-            raise UserError("callbacks.densify: budget null needs a threshold above 0, else nothing says how much may grow")
+            raise UserError(
+                "callbacks.densify: budget null needs a threshold above 0, else nothing says how much may grow"
+            )
 
     def on_fit_start(self, trainer, phase) -> None:
         phase.track_gradients = True

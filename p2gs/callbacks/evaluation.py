@@ -1,4 +1,5 @@
-"""``evaluation``: joint errors while the articulation phase learns, where the scene has ground truth. Logged only: nothing flows back.
+"""``evaluation``: joint errors while the articulation phase learns, where the scene has ground truth. Logged only:
+nothing flows back.
 
 The only callback that opens ground truth.
 """
@@ -13,7 +14,8 @@ from p2gs.types import Joint, Similarity, UserError
 
 @register_callback("evaluation")
 class Evaluation(Callback):
-    """every: steps between two scores.  prismatic_below: a free motion that turns by fewer degrees counts as a slide."""
+    """every: steps between two scores.  prismatic_below: a free motion that turns by fewer degrees counts as a
+    slide."""
 
     changes_result = False
     every: int = 250
@@ -60,7 +62,11 @@ def current_joints(phase, similarity: Similarity, prismatic_below: float) -> Opt
     for k, kind in enumerate(name_types(learned.types, learned.transforms, prismatic_below)):
         rows = labels == k + 1
         points = learned.gaussians.means[rows if bool(rows.any()) else slice(None)].double()
-        joints.append(make_joint(kind, similarity.transform_to_input(learned.transforms[k].double()), similarity.to_input(points).mean(0)))
+        joints.append(
+            make_joint(
+                kind, similarity.transform_to_input(learned.transforms[k].double()), similarity.to_input(points).mean(0)
+            )
+        )
     return joints
 
 
@@ -73,6 +79,10 @@ def joint_scores(joints: list[Joint], truth) -> dict[str, float]:
     values = {"failures": float(metric.compute()["failures"])}
     for score in metric.report.joints:
         if score.errors is not None:
-            errors = {"axis_angle": score.errors.axis_angle, "axis_position": score.errors.axis_position, "motion": score.errors.motion}
+            errors = {
+                "axis_angle": score.errors.axis_angle,
+                "axis_position": score.errors.axis_position,
+                "motion": score.errors.motion,
+            }
             values.update({f"{score.gt + 1}/{k}": v for k, v in errors.items() if v is not None})
     return values

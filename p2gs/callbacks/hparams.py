@@ -1,4 +1,5 @@
-"""TensorBoard over many runs: what a run was given and what it scored (HPARAMS), and its losses by family (CUSTOM SCALARS)."""
+"""TensorBoard over many runs: what a run was given and what it scored (HPARAMS), and its losses by family (CUSTOM
+SCALARS)."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ WHOLE = ("canonical", "repel")  # sections whose every value is shown
 
 @register_callback("families")
 class Families(Callback):
-    """The losses of a phase as one chart a kind (image, prior, parts, motion, physics, own), and joints and their errors beside.
+    """The losses of a phase as one chart a kind (image, prior, parts, motion, physics, own), and joints and their
+    errors beside.
 
     Uses the tags that the callbacks ``scalars`` and ``evaluation`` write.
     """
@@ -33,7 +35,8 @@ class Families(Callback):
 
 
 def layout(phase_name: str, losses: dict[str, Any]) -> dict:
-    """The layout for ``SummaryWriter.add_custom_scalars``: category -> chart -> ["Multiline", [regular expressions of tags]]."""
+    """The layout for ``SummaryWriter.add_custom_scalars``: category -> chart -> ["Multiline", [regular expressions of
+    tags]]."""
     charts: dict[str, list] = {"total": ["Multiline", [f"^{phase_name}/loss/total$"]]}
     for name, loss in losses.items():
         charts.setdefault(loss.kind, ["Multiline", []])[1].append(f"^{phase_name}/loss/{name}$")
@@ -49,11 +52,14 @@ def layout(phase_name: str, losses: dict[str, Any]) -> dict:
     return out
 
 
+#
+#
 # -- after the run -----------------------------------------------------------------------------------------------------------------
 
 
 def run_parameters(config: dict) -> dict[str, Any]:
-    """What a sweep is likely to vary, flat: seed, scene, steps, starts, weights and variants of losses, canonicalisation, repel points.
+    """What a sweep is likely to vary, flat: seed, scene, steps, starts, weights and variants of losses,
+    canonicalisation, repel points.
 
     config: RUN/config.yaml as plain values. A loss that is off in the articulation phase has weight 0.
     """
@@ -69,7 +75,8 @@ def run_parameters(config: dict) -> dict[str, Any]:
             elif name == "losses":
                 for loss, options in value.items():
                     if options is None:
-                        if phase == "articulation":  # where ablations switch them; elsewhere it would be a column a loss
+                        # where ablations switch them; elsewhere it would be a column a loss
+                        if phase == "articulation":
                             out[f"{phase}.{loss}.weight"] = 0.0
                     else:
                         out |= {f"{phase}.{loss}.{k}": options[k] for k in OF_LOSS if k in options}
@@ -77,7 +84,8 @@ def run_parameters(config: dict) -> dict[str, Any]:
 
 
 def run_scores(run: Path | str) -> dict[str, float]:
-    """The numbers of RUN/metrics.json that a sweep is sorted by, and the minutes that the fit took. {} before ``p2gs test``."""
+    """The numbers of RUN/metrics.json that a sweep is sorted by, and the minutes that the fit took. {} before ``p2gs
+    test``."""
     run = Path(run)
     if not (run / "metrics.json").is_file():
         return {}
@@ -86,7 +94,11 @@ def run_scores(run: Path | str) -> dict[str, float]:
     joints = metrics.get("joints") or {}
     names = ("failures", "axis_angle_mean", "pos_mean_artgs", "pos_mean_revolute", "motion_mean")
     out |= {f"joints/{name}": joints.get(name) for name in names}
-    out |= {f"chamfer/{name}": entry["value"] for name, entry in (metrics.get("chamfer") or {}).items() if isinstance(entry, dict)}
+    out |= {
+        f"chamfer/{name}": entry["value"]
+        for name, entry in (metrics.get("chamfer") or {}).items()
+        if isinstance(entry, dict)
+    }
     out |= {f"views/{name}": value for name, value in ((metrics.get("views") or {}).get("mean") or {}).items()}
     out |= {f"penetration/{name}": value for name, value in (metrics.get("penetration") or {}).items()}
     if stages_file(run).is_file():
@@ -95,7 +107,8 @@ def run_scores(run: Path | str) -> dict[str, float]:
 
 
 def write_hparams(run: Path | str) -> Optional[Path]:
-    """RUN/logs/hparams: the run's parameters and scores for TensorBoard's HPARAMS page; the folder, or None for a run without scores."""
+    """RUN/logs/hparams: the run's parameters and scores for TensorBoard's HPARAMS page; the folder, or None for a run
+    without scores."""
     from torch.utils.tensorboard import SummaryWriter
     from torch.utils.tensorboard.summary import hparams
 

@@ -9,7 +9,8 @@ from p2gs.callbacks.base import Callback, due, register_callback, run_folder
 
 @register_callback("previews")
 class Previews(Callback):
-    """every: steps between pictures, 0 = only at the end of the phase.  times: states to render.  Older ones are kept when ``keep``."""
+    """every: steps between pictures, 0 = only at the end of the phase.  times: states to render.  Older ones are kept
+    when ``keep``."""
 
     changes_result = False
     every: int = 0

@@ -32,7 +32,8 @@ def status_line(phase, steps_per_second: float, losses: int = 4) -> str:
 
 @register_callback("progress")
 class Progress(Callback):
-    """every_seconds: between two updates of the live line.  plain_seconds: between two lines where stdout is no terminal.
+    """every_seconds: between two updates of the live line.  plain_seconds: between two lines where stdout is no
+    terminal.
     losses: how many losses are shown beside the total.
     """
 

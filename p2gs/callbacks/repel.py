@@ -1,4 +1,5 @@
-"""``repel``: place the repel points anew while parts move (the paper's "dynamic" variant; without this callback they stay fixed)."""
+"""``repel``: place the repel points anew while parts move (the paper's "dynamic" variant; without this callback they
+stay fixed)."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from p2gs.callbacks.base import Callback, register_callback
 
 @register_callback("repel")
 class RepelRefresh(Callback):
-    """every: steps between two placements (paper: 5,000 of 20,000).  fraction: of the phase instead, when above 0 (0.25 is the paper's
-    ratio for a phase of any length).
+    """every: steps between two placements (paper: 5,000 of 20,000).  fraction: of the phase instead, when above 0 (0.25
+    is the paper's ratio for a phase of any length).
     """
 
     every: int = 5000

@@ -13,8 +13,8 @@ from p2gs.callbacks.base import Callback, due, register_callback
 class Scalars(Callback):
     """Losses by name, Gaussian count and the phase's summary (joint parameters, part masses) to every logger.
 
-    every: steps between two entries. Goes to ``logger.log_metrics`` directly: ``LightningModule.log`` costs 0.2-0.35 ms a key and
-    step whatever its interval, a quarter of a training step with a dozen losses.
+    every: steps between two entries. Goes to ``logger.log_metrics`` directly: ``LightningModule.log`` costs 0.2-0.35 ms
+    a key and step whatever its interval, a quarter of a training step with a dozen losses.
     """
 
     changes_result = False

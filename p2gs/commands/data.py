@@ -50,7 +50,9 @@ def synth(args: argparse.Namespace) -> int:
             raise UserError(f"data synth: {name} is {value}, expected at least 1")
     given = {k: v for k, v in given.items() if v is not None}
     folder = synthesize(args.out, seed=args.seed, kind=args.kind, format=args.format, depth=not args.no_depth, **given)
-    print(f"{folder}: written; train on it with: p2gs fit -c preset/cpu.yaml -c data/{args.format}.yaml --data.root {folder}")
+    print(
+        f"{folder}: written; train on it with: p2gs fit -c preset/cpu.yaml -c data/{args.format}.yaml --data.root {folder}"
+    )
     return 0
 
 
@@ -81,6 +83,10 @@ def capture(args: argparse.Namespace) -> int:
         poses=None if args.poses is None else Path(args.poses), static=args.static, height=args.height,
         max_views=args.max_views, size=args.size, careful=args.careful,
     )  # fmt: skip
-    folder = capture_scene(Path(args.start), Path(args.end), Path(args.out), options, progress=lambda text: print(text, flush=True))
-    print(f"{folder}: written; look at capture.html there, then: p2gs fit -c preset/cpu.yaml -c data/artgs.yaml --data.root {folder}")
+    folder = capture_scene(
+        Path(args.start), Path(args.end), Path(args.out), options, progress=lambda text: print(text, flush=True)
+    )
+    print(
+        f"{folder}: written; look at capture.html there, then: p2gs fit -c preset/cpu.yaml -c data/artgs.yaml --data.root {folder}"
+    )
     return 0

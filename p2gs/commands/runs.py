@@ -1,4 +1,5 @@
-"""The commands on a finished run: test, predict, export, view. Each takes the parsed arguments, returns the exit code."""
+"""The commands on a finished run: test, predict, export, view. Each takes the parsed arguments, returns the exit
+code."""
 
 from __future__ import annotations
 
@@ -25,16 +26,20 @@ def finished_run(folder: str) -> Path:
 
 
 def load_run_plugins(run: Path) -> None:
-    """Import what the fit imported: a rasterizer of the user's own draws the run's pictures, too. Raises UserError where it cannot be."""
+    """Import what the fit imported: a rasterizer of the user's own draws the run's pictures, too. Raises UserError
+    where it cannot be."""
     named = run_values(run).get("plugins") or []
     try:
         load_plugins(tuple(map(str, named if isinstance(named, list) else [named])))
     except UserError as err:
-        raise UserError(f"{err}; {run / 'config.yaml'} names it: start p2gs where it lies, or have its folder on PYTHONPATH") from err
+        raise UserError(
+            f"{err}; {run / 'config.yaml'} names it: start p2gs where it lies, or have its folder on PYTHONPATH"
+        ) from err
 
 
 def test(args: argparse.Namespace) -> int:
-    """Score a run, write metrics.json, print the figures; a report.html that is there is written anew, now with scores."""
+    """Score a run, write metrics.json, print the figures; a report.html that is there is written anew, now with
+    scores."""
     from rich import print as rich_print
 
     from p2gs.callbacks.hparams import write_hparams
@@ -79,7 +84,8 @@ def view(args: argparse.Namespace) -> int:
 
 
 def export(args: argparse.Namespace) -> int:
-    """Other formats of the twin; prints the files. With --check the verdict on those that are there: 1 where one fails."""
+    """Other formats of the twin; prints the files. With --check the verdict on those that are there: 1 where one
+    fails."""
     run = finished_run(args.run)
     if args.check:
         return _check(run if args.out is None else Path(args.out))
@@ -91,7 +97,11 @@ def export(args: argparse.Namespace) -> int:
     if args.profile is not None and args.format is not None:
         raise UserError(f"--format: the profile {args.profile} has its own; give one or the other")
     options = {name: getattr(args, name) for name in ("up", "origin", "extend_range", "material", "fixed", "splats")}
-    options |= {"scale": _metres_per_unit(args, run), "names": None if args.name is None else parse_names(args.name), "note": _warn}
+    options |= {
+        "scale": _metres_per_unit(args, run),
+        "names": None if args.name is None else parse_names(args.name),
+        "note": _warn,
+    }
     if args.profile is not None:
         written = export_profile(run, args.profile, args.out, args.meta, **options)
     else:

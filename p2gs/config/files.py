@@ -18,7 +18,8 @@ from p2gs.types import UserError, short
 
 @dataclass
 class Layer:
-    """One config file or the command line. where: what an error message starts with (``configs/x.yaml: `` or nothing)."""
+    """One config file or the command line. where: what an error message starts with (``configs/x.yaml: `` or
+    nothing)."""
 
     tree: Plain
     where: str = ""
@@ -36,7 +37,9 @@ class _StrictLoader(yaml.SafeLoader):
             if not isinstance(key, str) and not isinstance(key, (int, float)):
                 raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is no text", key_node.start_mark)
             if key in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' is given twice", key_node.start_mark)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key '{key}' is given twice", key_node.start_mark
+                )
             seen.add(key)
         return super().construct_mapping(node, deep)
 
@@ -48,7 +51,8 @@ def config_folders() -> list[Path]:
 
 
 def find_config(name: str, beside: Optional[Path] = None) -> Path:
-    """The config file of that name: as given (relative to ``beside``), else among p2gs's own; ``.yaml`` may be left out."""
+    """The config file of that name: as given (relative to ``beside``), else among p2gs's own; ``.yaml`` may be left
+    out."""
     given = Path(name)
     tries = [(beside / given) if beside else given]
     inner = Path(*given.parts[1:]) if given.parts and given.parts[0] == "configs" and len(given.parts) > 1 else given
@@ -68,11 +72,13 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def read_config(name: str, beside: Optional[Path] = None, parents: tuple[Path, ...] = (), strict: bool = False) -> list[Layer]:
+def read_config(
+    name: str, beside: Optional[Path] = None, parents: tuple[Path, ...] = (), strict: bool = False
+) -> list[Layer]:
     """The layers of a config file: what its ``include`` names first (relative to it), then itself.
 
-    An include that leads out of the folder of the file that was named first, and is none of p2gs's own, is named before it is read; where
-    ``strict`` (or the file says ``strict_paths: true``) it is refused with a UserError.
+    An include that leads out of the folder of the file that was named first, and is none of p2gs's own, is named before
+    it is read; where ``strict`` (or the file says ``strict_paths: true``) it is refused with a UserError.
     """
     path = find_config(name, beside)
     if parents:
@@ -95,7 +101,9 @@ def read_config(name: str, beside: Optional[Path] = None, parents: tuple[Path, .
         raise UserError(f"{path}: include: expected a file or a list of files, got {short(includes)}")
     layers: list[Layer] = []
     for include in includes:
-        layers += read_config(include, path.parent, (*parents, path.resolve()), strict or tree.get("strict_paths") is True)
+        layers += read_config(
+            include, path.parent, (*parents, path.resolve()), strict or tree.get("strict_paths") is True
+        )
     return [*layers, Layer(tree, f"{path}: ")]
 
 
@@ -128,7 +136,8 @@ MAX_VALUES = 10_000  # of a config, aliases counted as often as they stand for s
 
 
 def _check_tree(tree: Plain, where: str) -> None:
-    """Raise UserError where a config is deeper or larger than any can be: aliases make a few lines endless, and what reads them hangs."""
+    """Raise UserError where a config is deeper or larger than any can be: aliases make a few lines endless, and what
+    reads them hangs."""
     count, todo = 0, [(tree, 0)]
     while todo:
         value, depth = todo.pop()
@@ -140,14 +149,17 @@ def _check_tree(tree: Plain, where: str) -> None:
 
 
 def parse_overrides(words: list[str]) -> list[tuple[str, Any]]:
-    """``--a.b 1 --c=x`` -> ``[("a.b", "1"), ("c", "x")]``. Values stay text, but null, [lists] and {mappings} are read as YAML.
+    """``--a.b 1 --c=x`` -> ``[("a.b", "1"), ("c", "x")]``. Values stay text, but null, [lists] and {mappings} are read
+    as YAML.
 
     Raises UserError where a value is missing or a word belongs to no option.
     """
     out, rest = [], iter(words)
     for word in rest:
         if not word.startswith("--") or len(word) < 3:
-            raise UserError(f"'{word}' belongs to no option (single values are given as --key value, config files as -c FILE)")
+            raise UserError(
+                f"'{word}' belongs to no option (single values are given as --key value, config files as -c FILE)"
+            )
         key, equals, value = word[2:].partition("=")
         if not equals:
             value = next(rest, "--none")
@@ -180,7 +192,9 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-_Dumper.add_representer(list, lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True))
+_Dumper.add_representer(
+    list, lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+)
 
 
 def to_yaml(tree: Plain) -> str:

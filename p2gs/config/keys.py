@@ -59,7 +59,8 @@ class Options:
 def run_keys(data_format: Optional[str]) -> Keys:
     """All keys a config may have, given the data format and what is registered by now.
 
-    A phase whose class says ``trained = False`` has neither losses nor callbacks. Raises UserError for an unknown format.
+    A phase whose class says ``trained = False`` has neither losses nor callbacks. Raises UserError for an unknown
+    format.
     """
     losses = {name: keys_of(cls) for name, cls in LOSSES.items()}
     callbacks = {name: keys_of(cls) for name, cls in CALLBACKS.items()}
@@ -68,7 +69,9 @@ def run_keys(data_format: Optional[str]) -> Keys:
         inner = {"losses": losses, "callbacks": callbacks} if getattr(cls, "trained", True) else {}
         both = inner.keys() & keys_of(cls.Config).keys()
         if both:
-            raise TypeError(f"{cls.__qualname__}.Config: '{both.pop()}' is a section of every phase and cannot be a field")
+            raise TypeError(
+                f"{cls.__qualname__}.Config: '{both.pop()}' is a section of every phase and cannot be a field"
+            )
         phases[name] = {**keys_of(cls.Config), **inner}
     data = {"format": None, **keys_of(data_class(data_format))}
     return {**keys_of(Options), "p2gs": None, "data": data, "phases": phases, "callbacks": callbacks}

@@ -1,8 +1,9 @@
-"""The config of a run: several YAML files and single fields of the command line, merged, checked and turned into typed objects.
+"""The config of a run: several YAML files and single fields of the command line, merged, checked and turned into typed
+objects.
 
-Losses and callbacks are sections keyed by the name they are registered under. A section that is mentioned is on (``{}`` = on
-with defaults), ``null`` switches it off, what is not mentioned is off; later files and the command line merge into earlier ones
-field by field. ``callbacks`` at the top is for all phases; a phase's own ``callbacks`` merge into it.
+Losses and callbacks are sections keyed by the name they are registered under. A section that is mentioned is on (``{}``
+= on with defaults), ``null`` switches it off, what is not mentioned is off; later files and the command line merge into
+earlier ones field by field. ``callbacks`` at the top is for all phases; a phase's own ``callbacks`` merge into it.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from p2gs.types import UserError, short
 
 
 class PhaseSection:
-    """A phase's part of the config. config: instance of ``Phase.Config``.  losses, callbacks: those switched on, by name.
+    """A phase's part of the config. config: instance of ``Phase.Config``.  losses, callbacks: those switched on, by
+    name.
 
     callbacks are those of all phases (``shared``, as given) with what the phase's own section says laid on them.
     """
@@ -52,11 +54,18 @@ class PhaseSection:
         """What decides the phase's result: its options, losses, and callbacks that change it."""
         if self._losses is None:
             return self._config.values
-        callbacks = {name: given.values for name, given in self._callbacks.items() if self.callbacks[name].changes_result}
-        return {**self._config.values, "losses": {name: given.values for name, given in self._losses.items()}, "callbacks": callbacks}
+        callbacks = {
+            name: given.values for name, given in self._callbacks.items() if self.callbacks[name].changes_result
+        }
+        return {
+            **self._config.values,
+            "losses": {name: given.values for name, given in self._losses.items()},
+            "callbacks": callbacks,
+        }
 
     def to_dict(self) -> Plain:
-        """All of it; of the callbacks what the phase's own section says, so that a later file still reaches the others."""
+        """All of it; of the callbacks what the phase's own section says, so that a later file still reaches the
+        others."""
         if self._losses is None:
             return self._config.values
         full = {name: given.values for name, given in self._callbacks.items()}
@@ -67,7 +76,9 @@ class PhaseSection:
 
 def switched_on(registry: Registry, tree: Plain, path: str) -> dict[str, Given]:
     """The registered classes that the tree mentions, but those it says null of."""
-    return {name: Given(cls, tree[name], f"{path}{name}.") for name, cls in registry.items() if tree.get(name) is not None}
+    return {
+        name: Given(cls, tree[name], f"{path}{name}.") for name, cls in registry.items() if tree.get(name) is not None
+    }
 
 
 def written(registry: Registry, on: dict[str, Given]) -> Optional[Plain]:
@@ -76,7 +87,8 @@ def written(registry: Registry, on: dict[str, Given]) -> Optional[Plain]:
 
 
 class RunConfig:
-    """The merged config. Attributes: those of ``Options``, ``phases`` (name -> PhaseSection), ``data`` (built when first asked for)."""
+    """The merged config. Attributes: those of ``Options``, ``phases`` (name -> PhaseSection), ``data`` (built when
+    first asked for)."""
 
     def __init__(self, tree: Plain, data_format: Optional[str]):
         """tree: merged, its keys checked."""
@@ -116,11 +128,13 @@ class RunConfig:
         return Path(self.run) if self.run else Path("runs") / self.scene_name
 
     def phase_config(self, name: str) -> Any:
-        """Options of a phase; their defaults where this config does not mention it. Raises UserError for an unknown name."""
+        """Options of a phase; their defaults where this config does not mention it. Raises UserError for an unknown
+        name."""
         return self.phases[name].config if name in self.phases else PHASES[name].Config()
 
     def section(self, name: str) -> Any:
-        """What decides the result of a phase, the data's options or a top-level option, as plain values. Raises KeyError."""
+        """What decides the result of a phase, the data's options or a top-level option, as plain values. Raises
+        KeyError."""
         if name in self.phases:
             return self.phases[name].decisive()
         return self.data_options if name == "data" else self._options.values[name]
@@ -129,9 +143,16 @@ class RunConfig:
         """The whole merged config, defaults included, as plain values: ``load_config`` reads it back."""
         phases = {name: section.to_dict() for name, section in self.phases.items()}
         phases |= {name: None for name in PHASES if name not in phases}
-        return {**self._options.values, "data": self.data_options, "phases": phases, "callbacks": written(CALLBACKS, self._callbacks)}
+        return {
+            **self._options.values,
+            "data": self.data_options,
+            "phases": phases,
+            "callbacks": written(CALLBACKS, self._callbacks),
+        }
 
 
+#
+#
 # -- loading -----------------------------------------------------------------------------------------------------------------------
 
 
@@ -181,7 +202,8 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
 
 
 def _format_found(root: Path) -> str:
-    """The data format that the folder given as data.root looks like. Raises UserError where it is none, or there is no such folder."""
+    """The data format that the folder given as data.root looks like. Raises UserError where it is none, or there is no
+    such folder."""
     from p2gs.data.layouts import LAYOUTS, detect_format
 
     try:
@@ -193,7 +215,9 @@ def _format_found(root: Path) -> str:
     found = detect_format(root)
     if found is None:
         known = ", ".join(LAYOUTS)
-        raise UserError(f"data.format is not given, and {root} looks like none of the layouts {known}; give --data.format NAME")
+        raise UserError(
+            f"data.format is not given, and {root} looks like none of the layouts {known}; give --data.format NAME"
+        )
     return found
 
 
@@ -203,10 +227,11 @@ def import_builtins() -> None:
         module = importlib.import_module(f"p2gs.{package}")
         for info in pkgutil.iter_modules(module.__path__):
             importlib.import_module(f"p2gs.{package}.{info.name}")
-    for stage in ("discovery", "finish"):
-        importlib.import_module(f"p2gs.runtime.{stage}")
+    importlib.import_module("p2gs.runtime.finish")
 
 
+#
+#
 # -- saving ------------------------------------------------------------------------------------------------------------------------
 
 

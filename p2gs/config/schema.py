@@ -1,7 +1,8 @@
-"""Typed sections of a config: jsonargparse reads the options of a class, checks given ones, knows the defaults and makes the object.
+"""Typed sections of a config: jsonargparse reads the options of a class, checks given ones, knows the defaults and
+makes the object.
 
-Merging is ours, on plain dicts: jsonargparse (hence LightningCLI) replaces a ``dict[str, Loss]`` as a whole where it should
-merge, without a word; and so is the sentence for a mistake, which names the nearest right key.
+Merging is ours, on plain dicts: jsonargparse (hence LightningCLI) replaces a ``dict[str, Loss]`` as a whole where it
+should merge, without a word; and so is the sentence for a mistake, which names the nearest right key.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ from p2gs.types import UserError, short
 Plain = dict[str, Any]
 Keys = dict[str, Any]  # option names, nested as they are given; None: a single value
 IT = "it"  # where jsonargparse keeps a class's options
-set_parsing_settings(instantiate_subclass_spec_in_any=False)  # a config makes no object of a class that nothing asked for
+# a config makes no object of a class that nothing asked for
+set_parsing_settings(instantiate_subclass_spec_in_any=False)
 
 
 def merge(base: Plain, over: Plain) -> Plain:
-    """``over`` laid on ``base``: dicts merge key by key, anything else (null too) replaces. Neither argument is changed."""
+    """``over`` laid on ``base``: dicts merge key by key, anything else (null too) replaces. Neither argument is
+    changed."""
     out = dict(base)
     for key, value in over.items():
         out[key] = merge(out[key], value) if isinstance(value, dict) and isinstance(out.get(key), dict) else value
@@ -61,7 +64,8 @@ def keys_of(cls: type) -> Keys:
 
 
 class Given:
-    """Options of a class: those given, checked, and the defaults of the others. Raises UserError on a value of the wrong type.
+    """Options of a class: those given, checked, and the defaults of the others. Raises UserError on a value of the
+    wrong type.
 
     path: of the section in the config, with a dot at its end.  values: every option as YAML holds it.
     """
@@ -100,7 +104,11 @@ class Given:
 def _without_null(tree: Plain, keys: Keys) -> Plain:
     """The tree without groups of options that are null: these stay at their defaults."""
     groups = {name: inner for name, inner in keys.items() if inner is not None}
-    return {k: _without_null(v, groups[k]) if k in groups else v for k, v in tree.items() if k not in groups or v is not None}
+    return {
+        k: _without_null(v, groups[k]) if k in groups else v
+        for k, v in tree.items()
+        if k not in groups or v is not None
+    }
 
 
 def plain(value: Any) -> Any:
@@ -112,11 +120,14 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
+#
+#
 # -- mistakes, told in a sentence --------------------------------------------------------------------------------------------------
 
 
 def check_keys(tree: Plain, keys: Keys, where: str = "") -> None:
-    """Raise UserError at the first key that does not exist or is no section where one is needed. where: prefix of the message."""
+    """Raise UserError at the first key that does not exist or is no section where one is needed. where: prefix of the
+    message."""
 
     def check(tree: Plain, level: Keys, path: str) -> None:
         for name, value in tree.items():
@@ -139,7 +150,8 @@ def walk(keys: Keys, prefix: str = "") -> Iterator[str]:
 
 
 def nearest(path: str, known: list[str]) -> str:
-    """`` (did you mean 'x'?)``: the key that ends so, a sibling like it, its name elsewhere, a name like it elsewhere; or the siblings."""
+    """`` (did you mean 'x'?)``: the key that ends so, a sibling like it, its name elsewhere, a name like it elsewhere;
+    or the siblings."""
     parent, _, last = path.rpartition(".")
     siblings = {k.rpartition(".")[2]: k for k in known if k.rpartition(".")[0] == parent}
     names = {k.rpartition(".")[2] for k in known}
@@ -161,7 +173,13 @@ def nearest(path: str, known: list[str]) -> str:
 
 def describe(hint: Any) -> str:
     """A type in words a user reads: ``a number``, ``one of a, b``, ``a whole number or null``."""
-    words: dict[Any, str] = {int: "a whole number", float: "a number", str: "text", bool: "true or false", Path: "a path"}
+    words: dict[Any, str] = {
+        int: "a whole number",
+        float: "a number",
+        str: "text",
+        bool: "true or false",
+        Path: "a path",
+    }
     if hint in words:
         return words[hint]
     origin, args = typing.get_origin(hint), typing.get_args(hint)

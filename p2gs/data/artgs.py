@@ -1,8 +1,10 @@
-"""The ArtGS layout: ``transforms_{train,test}_{start,end}.json`` and ``{start,end}/{train,test}/{rgba,depth}/NNNN.png``.
+"""The ArtGS layout: ``transforms_{train,test}_{start,end}.json`` and
+``{start,end}/{train,test}/{rgba,depth}/NNNN.png``.
 
-One field of view for all views (``camera_angle_x``, ``camera_angle_y``), principal point in the centre, camera-to-world poses
-in OpenGL axes, depth (optional) as uint16 millimetres at the rgba path with ``rgba`` replaced by ``depth``. Beyond ArtGS itself,
-``fl_x, fl_y, cx, cy`` of the file or of a frame are honoured. Format: ArtGS, scene/dataset_readers.py.
+One field of view for all views (``camera_angle_x``, ``camera_angle_y``), principal point in the centre, camera-to-world
+poses in OpenGL axes, depth (optional) as uint16 millimetres at the rgba path with ``rgba`` replaced by ``depth``.
+Beyond ArtGS itself, ``fl_x, fl_y, cx, cy`` of the file or of a frame are honoured. Format: ArtGS,
+scene/dataset_readers.py.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ def ground_truth_folder(root: Path) -> Optional[Path]:
 
 
 def image_path(root: Path, file_path: str) -> Path:
-    """Where a frame's RGBA image lies: ``.png`` added where there is no suffix, ``.jpg`` beside an ``rgba`` folder sent there."""
+    """Where a frame's RGBA image lies: ``.png`` added where there is no suffix, ``.jpg`` beside an ``rgba`` folder sent
+    there."""
     path = root / file_path
     if path.suffix.lower() in (".jpg", ".jpeg") and (path.parent.parent / "rgba").is_dir():
         path = path.parent.parent / "rgba" / f"{path.stem}.png"
@@ -99,7 +102,9 @@ def index(root: Path, report: Report) -> list[Frame]:
                     report.error(f"{where} needs 'file_path' and 'transform_matrix'")
                     continue
                 if not isinstance(entry["file_path"], str) or not entry["file_path"]:
-                    report.error(f"{where}: file_path is {short(entry['file_path'])}, expected the path of an image below {root}")
+                    report.error(
+                        f"{where}: file_path is {short(entry['file_path'])}, expected the path of an image below {root}"
+                    )
                     continue
                 image = image_path(root, entry["file_path"])
                 viewmat = opengl_pose(entry["transform_matrix"], where, report)
@@ -112,8 +117,12 @@ def index(root: Path, report: Report) -> list[Frame]:
                 elif viewmat is not None and intrinsics is not None:
                     K, fov = intrinsics
                     if entry.get("time") not in (None, state):
-                        report.note(f"{where} has time {short(entry['time'])}, but it is read as state {state} by the file's name")
-                    frames.append(Frame(image.stem, state, split, image, viewmat, K=K, fov=fov, K_source=camera_file, depth=depth))
+                        report.note(
+                            f"{where} has time {short(entry['time'])}, but it is read as state {state} by the file's name"
+                        )
+                    frames.append(
+                        Frame(image.stem, state, split, image, viewmat, K=K, fov=fov, K_source=camera_file, depth=depth)
+                    )
                 if report.failed and intrinsics is None:
                     break  # the file's own intrinsics are wrong: once is enough
     with_depth = [f for f in frames if f.depth is not None]

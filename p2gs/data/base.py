@@ -29,7 +29,8 @@ DATASETS: Registry[type["TwoStateData"]] = Registry("data format")
 
 
 class Visit(NamedTuple):
-    """Which photograph a step looks at. step: of the phase, from 0.  state: 0 or 1.  view: its number among the state's training views."""
+    """Which photograph a step looks at. step: of the phase, from 0.  state: 0 or 1.  view: its number among the state's
+    training views."""
 
     step: int
     state: int = 0
@@ -37,11 +38,12 @@ class Visit(NamedTuple):
 
 
 class ViewLoader:
-    """The batches of a phase: an endless row of visits, each a pure function of (seed, step), so that a resumed run sees what an unbroken
-    one would.
+    """The batches of a phase: an endless row of visits, each a pure function of (seed, step), so that a resumed run
+    sees what an unbroken one would.
 
-    views: training views of each state that the phase looks at; the states take turns, and each view comes once before any comes twice.
-    None (a phase that renders no photograph): the step alone.  seed: of the order.  first: the step to begin at.
+    views: training views of each state that the phase looks at; the states take turns, and each view comes once before
+    any comes twice. None (a phase that renders no photograph): the step alone.  seed: of the order.  first: the step to
+    begin at.
     """
 
     def __init__(self, views: dict[int, int], seed: int = 0, first: int = 0):
@@ -67,7 +69,8 @@ class TwoStateData(LightningDataModule):
         max_views: at most so many training views a state, a farthest-point subset of the cameras (None = all).
         depth: ``auto`` reads depth where it is there, ``never`` leaves it out, ``always`` demands it.
         seed: of the order in which phases visit views, beside the run's.
-        normalize: ``object`` trains with the object's box (found from the masks) centred and 2 units in diagonal, ``none`` as on disk.
+        normalize: ``object`` trains with the object's box (found from the masks) centred and 2 units in diagonal,
+        ``none`` as on disk.
 
     strict_paths: the run's; files that lead out of ``root`` are refused, not only named.
     """
@@ -130,7 +133,8 @@ class TwoStateData(LightningDataModule):
         return self._raw
 
     def scene(self) -> TwoStateScene:
-        """The scene as training sees it: internal units, ``box`` set; made once. ``similarity`` leads back to input units."""
+        """The scene as training sees it: internal units, ``box`` set; made once. ``similarity`` leads back to input
+        units."""
         if self._scene is None:
             raw = self._raw or self.read()  # not kept: depth would be held twice
             self._scene = normalise(raw) if self.normalize == "object" else with_box(raw)
@@ -156,7 +160,8 @@ def with_box(scene: TwoStateScene) -> TwoStateScene:
 
 
 def thin_out(frames: Sequence[Shot], max_views: Optional[int]) -> list[Shot]:
-    """At most ``max_views`` training frames (or views) a state, spread over the cameras' positions; other splits stay whole."""
+    """At most ``max_views`` training frames (or views) a state, spread over the cameras' positions; other splits stay
+    whole."""
     if max_views is None:
         return list(frames)
     keep: set[int] = {i for i, f in enumerate(frames) if f.split != "train"}

@@ -1,7 +1,7 @@
 """The object's box from its silhouettes, and the scene brought to internal units.
 
-Of a grid around the cameras' common look-at point, what projects into the masks of one state's views is kept (its visual hull,
-Laurentini 1994, DOI 10.1109/34.273735); the box holds the hulls of both states.
+Of a grid around the cameras' common look-at point, what projects into the masks of one state's views is kept (its
+visual hull, Laurentini 1994, DOI 10.1109/34.273735); the box holds the hulls of both states.
 """
 
 from __future__ import annotations
@@ -44,12 +44,20 @@ def mask_bounds(alpha: Tensor) -> tuple[int, int, int, int]:
 
 
 def _sphere(views: Sequence[View]) -> tuple[np.ndarray, float]:
-    """Centre and radius of a ball around the object: where the rays through the masks' centres meet, and how wide the masks are."""
+    """Centre and radius of a ball around the object: where the rays through the masks' centres meet, and how wide the
+    masks are."""
     A, b, rays = np.zeros((3, 3)), np.zeros(3), []
     for v in views:
         x0, y0, x1, y1 = mask_bounds(v.alpha)
-        K, R, o = v.camera.K.double().numpy(), v.camera.viewmat[:3, :3].double().numpy(), v.camera.position.double().numpy()
-        corners = np.array([[(x0 + x1) / 2, (y0 + y1) / 2, 1], [x0, y0, 1], [x1, y1, 1], [x0, y1, 1], [x1, y0, 1]]) @ np.linalg.inv(K).T
+        K, R, o = (
+            v.camera.K.double().numpy(),
+            v.camera.viewmat[:3, :3].double().numpy(),
+            v.camera.position.double().numpy(),
+        )
+        corners = (
+            np.array([[(x0 + x1) / 2, (y0 + y1) / 2, 1], [x0, y0, 1], [x1, y1, 1], [x0, y1, 1], [x1, y0, 1]])
+            @ np.linalg.inv(K).T
+        )
         d = R.T @ corners[0]
         d /= np.linalg.norm(d)
         P = np.eye(3) - np.outer(d, d)
@@ -65,7 +73,8 @@ def _sphere(views: Sequence[View]) -> tuple[np.ndarray, float]:
 
 
 def _carve(views: Sequence[View], lo: np.ndarray, hi: np.ndarray, cells: int) -> np.ndarray:
-    """Lower and upper corner [2, 3] of the hull's cells (each as wide as a cell) inside the box lo..hi; [0, 3] where none is left."""
+    """Lower and upper corner [2, 3] of the hull's cells (each as wide as a cell) inside the box lo..hi; [0, 3] where
+    none is left."""
     import cv2
 
     step = (hi - lo) / cells
@@ -80,7 +89,8 @@ def _carve(views: Sequence[View], lo: np.ndarray, hi: np.ndarray, cells: int) ->
         z = cam[:, 2]
         seen = z > 1e-6
         zs = np.where(seen, z, 1)
-        # a cell is inside when its ball touches the mask, so masks grow by the ball's radius in pixels at the mean distance
+        # a cell is inside when its ball touches the mask, so masks grow by the ball's radius in pixels at the mean
+        # distance
         grow = int(np.ceil(half * max(K[0, 0], K[1, 1]) / max(float(np.median(zs)), 1e-6)))
         grow = min(grow, max(v.camera.width, v.camera.height) // 4)
         mask = (v.alpha.numpy() > 127).astype(np.uint8)
@@ -115,7 +125,9 @@ def object_box(views: Sequence[View], cells: int = 48) -> Tensor:
             box = _carve(mine, box[0], box[1], cells)
             if len(box) == 0:
                 name = ("start", "end")[state]
-                raise UserError(f"the masks of state '{name}' show no common object in space; cameras and masks do not belong together")
+                raise UserError(
+                    f"the masks of state '{name}' show no common object in space; cameras and masks do not belong together"
+                )
         corners.append(box)
     lo = np.min([c[0] for c in corners], axis=0)
     hi = np.max([c[1] for c in corners], axis=0)
@@ -131,7 +143,8 @@ def _to_internal(view: View, similarity: Similarity) -> View:
 
 
 def normalise(scene: TwoStateScene) -> TwoStateScene:
-    """The scene in internal units: its box is centred at the origin with a diagonal of 2. ``scene`` must be in input units."""
+    """The scene in internal units: its box is centred at the origin with a diagonal of 2. ``scene`` must be in input
+    units."""
     box = object_box(scene.select(split="train")) if scene.box is None else scene.box
     lo, hi = box.double()
     centre = (lo + hi) / 2

@@ -35,11 +35,14 @@ def _summary(root: Path, format: str, views: list[View]) -> str:
     return f"{root}: {format} layout, {numbers} views of {size}, {'depth in ' + str(depth) if depth else 'no depth'}"
 
 
-def check_dataset(root, format: Optional[str] = None, source: Optional[str] = None, strict_paths: bool = False) -> list[Finding]:
+def check_dataset(
+    root, format: Optional[str] = None, source: Optional[str] = None, strict_paths: bool = False
+) -> list[Finding]:
     """Every finding about the scene in ``root``, errors and notes, in the order in which a reader meets them.
 
-    format: layout name (artgs, dta, paris), found from the folder if not given.  source: PARIS only.  strict_paths: files that lead out of
-    the folder are errors and not read, else notes.  Never raises for a faulty scene; raises UserError for an unknown format name.
+    format: layout name (artgs, dta, paris), found from the folder if not given.  source: PARIS only.  strict_paths:
+    files that lead out of the folder are errors and not read, else notes.  Never raises for a faulty scene; raises
+    UserError for an unknown format name.
     """
     root = Path(root)
     report = Report(root=root, strict=strict_paths)
@@ -81,4 +84,6 @@ def _check_ground_truth(root: Path, format: str, source: Optional[str], report: 
         return
     for state, meshes in enumerate((truth.start, truth.end)):
         if not (meshes.whole and meshes.static and meshes.dynamic):
-            report.note(f"{truth.folder / STATES[state]}: lacks the mesh of the whole, the static or a moving part, shape cannot be scored")
+            report.note(
+                f"{truth.folder / STATES[state]}: lacks the mesh of the whole, the static or a moving part, shape cannot be scored"
+            )

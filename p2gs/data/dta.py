@@ -1,7 +1,8 @@
-"""The DTA (DigitalTwinArt) layout: one ``cam_K.txt``, ``init_keyframes.yml``, ``color_segmented``, ``mask``, ``depth_filtered``.
+"""The DTA (DigitalTwinArt) layout: one ``cam_K.txt``, ``init_keyframes.yml``, ``color_segmented``, ``mask``,
+``depth_filtered``.
 
-A frame id is ``<t>_<view>`` with t = 0 or 1; ``cam_in_ob`` is camera-to-world in OpenGL axes; depth is uint16 millimetres.
-All frames are training views. Format: DigitalTwinArt, main.py and preproc/gen_correspondence.py.
+A frame id is ``<t>_<view>`` with t = 0 or 1; ``cam_in_ob`` is camera-to-world in OpenGL axes; depth is uint16
+millimetres. All frames are training views. Format: DigitalTwinArt, main.py and preproc/gen_correspondence.py.
 """
 
 from __future__ import annotations
@@ -93,10 +94,16 @@ def index(root: Path, report: Report) -> list[Frame]:
             report.error(f"{path}: image is missing, but init_keyframes.yml has the frame '{key}'")
         if viewmat is not None and not missing:
             depth = depth if has_depth else None
-            frames.append(Frame(name, int(time), "train", image, viewmat, K=K, K_source=root / "cam_K.txt", mask=mask, depth=depth))
+            frames.append(
+                Frame(
+                    name, int(time), "train", image, viewmat, K=K, K_source=root / "cam_K.txt", mask=mask, depth=depth
+                )
+            )
     known = {str(key).removeprefix("frame_") for key in keyframes}
     unposed = sorted(p.stem for p in (root / "color_segmented").glob("*.png") if p.stem not in known)
     if unposed:
-        report.note(f"{root / 'init_keyframes.yml'}: {len(unposed)} images have no frame and are left out, the first is {unposed[0]}.png")
+        report.note(
+            f"{root / 'init_keyframes.yml'}: {len(unposed)} images have no frame and are left out, the first is {unposed[0]}.png"
+        )
     check_frames(frames, root, report)
     return frames

@@ -1,4 +1,5 @@
-"""A scene as it lies on disk before any pixel is read: one ``Frame`` per photograph, found by the layout's ``index`` function.
+"""A scene as it lies on disk before any pixel is read: one ``Frame`` per photograph, found by the layout's ``index``
+function.
 
 Shared by the layouts: JSON reading, pose conversion (camera-to-world OpenGL -> world-to-camera OpenCV) and its checks.
 """
@@ -17,17 +18,19 @@ from p2gs.types import Split
 
 STATES = ("start", "end")
 ORTHONORMAL_TOLERANCE = 1e-2  # largest entry of |R R^T - I| that passes as rounding of the file's numbers
-MAX_COORDINATE = 1e12  # scene units: farther away float32 has no digits left for an object, and squares near the end of its range
+# scene units: farther away float32 has no digits left for an object, and squares near the end of its range
+MAX_COORDINATE = 1e12
 
 
 @dataclass(frozen=True)
 class Frame:
     """One photograph's files and camera.
 
-    image: colour (and alpha) file.  mask: separate mask file (any channel count, > 0 is object) or None: alpha of ``image``.
+    image: colour (and alpha) file.  mask: separate mask file (any channel count, > 0 is object) or None: alpha of
+    ``image``.
     depth: 16-bit PNG in millimetres or None.  viewmat: [4, 4] float64 world -> camera (OpenCV).
-    K: [3, 3] float64 in pixels of the image file, or None when ``fov`` is given: (x, y) field of view in radians, principal
-    point in the image's centre, y None for square pixels.
+    K: [3, 3] float64 in pixels of the image file, or None when ``fov`` is given: (x, y) field of view in radians,
+    principal point in the image's centre, y None for square pixels.
     K_source: the file that the intrinsics come from, for messages.
     """
 
@@ -84,7 +87,8 @@ def read_json(path: Path, report: Report):
 
 
 def matrix_of(value, rows: int, cols: int) -> np.ndarray:
-    """[rows, cols] float64 of a nested or flat list of numbers (or their text, as YAML has 1e-05). Raises ValueError for anything else.
+    """[rows, cols] float64 of a nested or flat list of numbers (or their text, as YAML has 1e-05). Raises ValueError
+    for anything else.
 
     Counts before it converts: with YAML's aliases a short file holds lists without end.
     """
@@ -112,8 +116,8 @@ def pose_matrix(value) -> np.ndarray:
 def opengl_pose(matrix, where: str, report: Report) -> Optional[np.ndarray]:
     """World-to-camera OpenCV [4, 4] float64 from a camera-to-world OpenGL matrix (camera looks along -z, y up).
 
-    ``matrix``: 4x4 (or 3x4) nested list or 16 numbers.  ``where`` names the file and frame in messages.  The rotation is
-    projected to the nearest orthonormal one, so that rounding in the file does not become shear.
+    ``matrix``: 4x4 (or 3x4) nested list or 16 numbers.  ``where`` names the file and frame in messages.  The rotation
+    is projected to the nearest orthonormal one, so that rounding in the file does not become shear.
     """
     try:
         c2w = pose_matrix(matrix)
@@ -161,7 +165,8 @@ def check_K(K, where: str, report: Report) -> Optional[np.ndarray]:
 
 
 def check_frames(frames: list[Frame], root: Path, report: Report) -> None:
-    """What holds for every layout: training views in both states, unique names; test views and equal intrinsics are worth a note."""
+    """What holds for every layout: training views in both states, unique names; test views and equal intrinsics are
+    worth a note."""
     train = {s: [f for f in frames if f.state == s and f.split == "train"] for s in (0, 1)}
     for s, state in enumerate(STATES):
         if not train[s] and not report.failed:
@@ -175,7 +180,9 @@ def check_frames(frames: list[Frame], root: Path, report: Report) -> None:
         seen.add((f.state, f.split, f.name))
     if all(train.values()):
         if len(train[0]) != len(train[1]):
-            report.note(f"{root}: states have different numbers of training views ({len(train[0])} and {len(train[1])})")
+            report.note(
+                f"{root}: states have different numbers of training views ({len(train[0])} and {len(train[1])})"
+            )
         a, b = train[0][0], train[1][0]
         differ = (a.K is None) != (b.K is None)
         if not differ:

@@ -1,7 +1,9 @@
-"""Ground truth of a scene, for scoring only: joints from ``trans.json`` and part meshes. No training code imports this module.
+"""Ground truth of a scene, for scoring only: joints from ``trans.json`` and part meshes. No training code imports this
+module.
 
-``trans_info`` is a dict (one joint) or a list: axis origin ``o`` and direction ``d``, type rotate (degrees) or translate (scene
-units), range ``l`` (start) to ``r`` (end). The motion start -> end is (r - l) about or along the axis. Format: PARIS, DTA, ArtGS.
+``trans_info`` is a dict (one joint) or a list: axis origin ``o`` and direction ``d``, type rotate (degrees) or
+translate (scene units), range ``l`` (start) to ``r`` (end). The motion start -> end is (r - l) about or along the axis.
+Format: PARIS, DTA, ArtGS.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ class MeshPaths:
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """folder: where it was read.  joints: input units, float64, in the file's order.  start, end: the states' meshes."""
+    """folder: where it was read.  joints: input units, float64, in the file's order.  start, end: the states'
+    meshes."""
 
     folder: Path
     joints: tuple[Joint, ...]
@@ -60,11 +63,15 @@ def parse_joint(entry: dict, where: str) -> Joint:
         span = entry[kind]
         motion = float(span["r"]) - float(span["l"])
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as err:
-        raise UserError(f"{where} does not describe a joint (axis o and d, type rotate or translate, range l and r): {short(err)}") from err
+        raise UserError(
+            f"{where} does not describe a joint (axis o and d, type rotate or translate, range l and r): {short(err)}"
+        ) from err
     if not (torch.isfinite(axis).all() and torch.isfinite(origin).all() and math.isfinite(motion)):
         raise UserError(f"{where} holds numbers that are not finite, expected an axis o and d and a range l and r")
     if kind not in ("rotate", "translate") or not axis.norm() > 0:
-        raise UserError(f"{where} needs the type rotate or translate and an axis of some length, but has {short(kind)} and {axis.tolist()}")
+        raise UserError(
+            f"{where} needs the type rotate or translate and an axis of some length, but has {short(kind)} and {axis.tolist()}"
+        )
     axis = axis / axis.norm()
     if kind == "rotate":
         T = rotation_about(axis, origin, motion)
@@ -84,15 +91,17 @@ def _meshes(folder: Path, state: str, joints: int) -> MeshPaths:
     numbered = [base / f"{state}_dynamic_{i}_rotate.ply" for i in range(joints)]
     dynamic = (single,) if single and joints == 1 else tuple(p for p in numbered if p.is_file())
     return MeshPaths(
-        there(base / f"{state}_rotate.ply"), there(base / f"{state}_static_rotate.ply"), dynamic if len(dynamic) == joints else ()
+        there(base / f"{state}_rotate.ply"),
+        there(base / f"{state}_static_rotate.ply"),
+        dynamic if len(dynamic) == joints else (),
     )
 
 
 def load_ground_truth(root, format: Optional[str] = None, source: Optional[str] = None) -> Optional[GroundTruth]:
     """The scene's ground truth in input coordinates and units, or None where the scene has none.
 
-    format: layout name, found from the folder if not given.  source: PARIS only.  Raises UserError where trans.json is there but
-    cannot be understood.
+    format: layout name, found from the folder if not given.  source: PARIS only.  Raises UserError where trans.json is
+    there but cannot be understood.
     """
     root = Path(root)
     format = format or detect_format(root)

@@ -1,7 +1,7 @@
 """Pixels of a scene: RGBA, masks and depth read in a small thread pool, checked, and down-scaled where asked.
 
-Everything stays uint8 (depth float32). Colours are straight, as on disk; down-scaling averages premultiplied colour, so that the
-colour behind alpha = 0 does not bleed into the object's edge.
+Everything stays uint8 (depth float32). Colours are straight, as on disk; down-scaling averages premultiplied colour, so
+that the colour behind alpha = 0 does not bleed into the object's edge.
 """
 
 from __future__ import annotations
@@ -22,13 +22,16 @@ from p2gs.types import Camera, View
 DepthMode = Literal["auto", "never", "always"]
 MAX_PIXELS = (
     2**26
-)  # of one image, 8192 x 8192: a hundred times what is trained on. A header may claim any number, for which memory is asked
+    # of one image, 8192 x 8192: a hundred times what is trained on. A header may claim any number, for which memory is
+    # asked
+)
 FOCAL_RANGE = (1e-2, 1e8)  # pixels; beyond it all rays are parallel, or at right angles to the camera, in float32
 MIN_DEPTH = 0.1  # scene units (metres in the layouts' words); nearer is invalid, as in DTA and ArtGS
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Mean over the area of each new pixel. image [H, W] or [H, W, C], any dtype that cv2.INTER_AREA takes; same dtype out."""
+    """Mean over the area of each new pixel. image [H, W] or [H, W, C], any dtype that cv2.INTER_AREA takes; same dtype
+    out."""
     import cv2
 
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
@@ -63,7 +66,8 @@ def downscale_rgba(image: np.ndarray, alpha: np.ndarray, width: int, height: int
 
 
 def coverage(mask: np.ndarray) -> np.ndarray:
-    """Alpha of a mask file, uint8: any number above 0 is the object, as in DTA, unless most of the object is 255 and its rim lies between.
+    """Alpha of a mask file, uint8: any number above 0 is the object, as in DTA, unless most of the object is 255 and
+    its rim lies between.
 
     Such a mask was drawn with soft edges. Read as "above 0" it grows the object by half a pixel on all sides.
     """
@@ -73,7 +77,8 @@ def coverage(mask: np.ndarray) -> np.ndarray:
 
 
 def colour_of_rim(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Straight colour [H, W, 3] with the soft edge's pixels that were blacked out filled from their neighbours (two pixels far at most).
+    """Straight colour [H, W, 3] with the soft edge's pixels that were blacked out filled from their neighbours (two
+    pixels far at most).
 
     DTA's images are cut out along half of a mask's value: what is below is black, a rim that no object has.
     """
@@ -115,7 +120,8 @@ def _decode(path: Path, report: Report) -> Optional[np.ndarray]:
 
 
 def header_fits(path: Path, report: Report) -> bool:
-    """Whether an image file's header claims no more than ``MAX_PIXELS``; read before any memory is asked for. False after an error."""
+    """Whether an image file's header claims no more than ``MAX_PIXELS``; read before any memory is asked for. False
+    after an error."""
     from PIL import Image
 
     try:
@@ -135,23 +141,30 @@ def header_fits(path: Path, report: Report) -> bool:
 def _read_alpha(frame: Frame, image: np.ndarray, report: Report) -> Optional[np.ndarray]:
     if frame.mask is None:
         if image.ndim != 3 or image.shape[2] != 4:
-            report.error(f"{frame.image}: has no alpha channel; the alpha of an RGBA image is the object's mask in this layout")
+            report.error(
+                f"{frame.image}: has no alpha channel; the alpha of an RGBA image is the object's mask in this layout"
+            )
             return None
         alpha = image[..., 3]
     else:
         mask = _decode(frame.mask, report)
         if mask is None:
             return None
-        mask = mask if mask.ndim == 2 else mask[..., min(2, mask.shape[2] - 1)]  # cv2 gives BGR: index 2 is the file's first channel
+        # cv2 gives BGR: index 2 is the file's first channel
+        mask = mask if mask.ndim == 2 else mask[..., min(2, mask.shape[2] - 1)]
         if mask.shape != image.shape[:2]:
-            report.error(f"{frame.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, but its image is {image.shape[1]}x{image.shape[0]}")
+            report.error(
+                f"{frame.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, but its image is {image.shape[1]}x{image.shape[0]}"
+            )
             return None
         alpha = coverage(mask)
     if not alpha.any():
         report.error(f"{frame.mask or frame.image}: mask is empty, no pixel belongs to the object")
         return None
     if alpha.min() == 255:
-        report.note(f"{frame.mask or frame.image}: mask covers the whole image, so nothing parts the object from its background")
+        report.note(
+            f"{frame.mask or frame.image}: mask covers the whole image, so nothing parts the object from its background"
+        )
     return alpha
 
 
@@ -168,7 +181,9 @@ def _read_depth(frame: Frame, shape: tuple[int, int], report: Report) -> Optiona
         if abs(w * height - h * width) > max(w, h, width, height):
             report.error(f"{frame.depth}: is {w}x{h} pixels, which is not the shape of its {width}x{height} image")
             return None
-        report.note(f"{frame.depth}: is {w}x{h} pixels and is brought to the image's {width}x{height} by nearest neighbour")
+        report.note(
+            f"{frame.depth}: is {w}x{h} pixels and is brought to the image's {width}x{height} by nearest neighbour"
+        )
         depth = resize_nearest(depth, width, height)
     out = depth.astype(np.float32) * np.float32(1e-3)
     out[out < MIN_DEPTH] = 0
@@ -178,7 +193,9 @@ def _read_depth(frame: Frame, shape: tuple[int, int], report: Report) -> Optiona
 def _check_fit(K: np.ndarray, frame: Frame, width: int, height: int, report: Report) -> bool:
     low, high = FOCAL_RANGE
     if not (low < K[0, 0] < high and low < K[1, 1] < high):
-        report.error(f"{frame.K_source}: focal length of {K[0, 0]:g} x {K[1, 1]:g} pixels for {frame.image.name} is none of a photograph")
+        report.error(
+            f"{frame.K_source}: focal length of {K[0, 0]:g} x {K[1, 1]:g} pixels for {frame.image.name} is none of a photograph"
+        )
         return False
     cx, cy = K[0, 2], K[1, 2]
     point, image = f"principal point ({cx:.1f}, {cy:.1f})", f"the {width}x{height} image {frame.image.name}"
@@ -246,12 +263,17 @@ def check_sizes(frames: Sequence[Frame], views: Sequence[View], report: Report) 
             continue
         other, name = first.setdefault((f.K_source, f.K.tobytes()), (size, f.image.name))
         if size != other:
-            report.error(f"{f.image}: is {size[0]}x{size[1]} pixels, but {name} with the same K is {other[0]}x{other[1]}")
+            report.error(
+                f"{f.image}: is {size[0]}x{size[1]} pixels, but {name} with the same K is {other[0]}x{other[1]}"
+            )
             return
 
 
-def read_views(frames: Sequence[Frame], report: Report, downscale: float = 1.0, depth: DepthMode = "auto") -> list[View]:
-    """All frames that can be read, in order. Files are decoded by a few threads; findings keep the order of the frames."""
+def read_views(
+    frames: Sequence[Frame], report: Report, downscale: float = 1.0, depth: DepthMode = "auto"
+) -> list[View]:
+    """All frames that can be read, in order. Files are decoded by a few threads; findings keep the order of the
+    frames."""
     import cv2
 
     cv2.setNumThreads(0)  # the pool below is the parallelism; cv2's own threads would fight it

@@ -1,4 +1,5 @@
-"""The layouts that scenes are published in, by name. A layout is a module with ``detect``, ``index`` and ``ground_truth_folder``."""
+"""The layouts that scenes are published in, by name. A layout is a module with ``detect``, ``index`` and
+``ground_truth_folder``."""
 
 from __future__ import annotations
 

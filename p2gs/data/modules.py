@@ -54,9 +54,11 @@ class ArtGSData(TwoStateData):
 
 @DATASETS.register("synthetic")
 class SyntheticData(TwoStateData):
-    """A generated object (see ``data.synthetic``), written once to ``root`` in the ArtGS layout with its ground truth and read from there.
+    """A generated object (see ``data.synthetic``), written once to ``root`` in the ArtGS layout with its ground truth
+    and read from there.
 
-    root: folder to write to and read from; null keeps the scene in memory.  kind: demo, or a kind of generated object, null for any.
+    root: folder to write to and read from; null keeps the scene in memory.  kind: demo, or a kind of generated object,
+    null for any.
     object_seed: of the object and its cameras.  size: image side in pixels.  train_views, test_views: per state.
     """
 
@@ -86,7 +88,9 @@ class SyntheticData(TwoStateData):
 
         if self.root is None:
             obj = make_object(self.kind, self.object_seed)
-            scene = synthetic_scene(obj, round(self.size / self.downscale), self.train_views, self.test_views, self.object_seed)
+            scene = synthetic_scene(
+                obj, round(self.size / self.downscale), self.train_views, self.test_views, self.object_seed
+            )
             views = thin_out(scene.views, self.max_views)
             return scene.with_views(replace(v, depth=None) if self.depth == "never" else v for v in views)
         root = Path(self.root)
@@ -103,7 +107,8 @@ class SyntheticData(TwoStateData):
 
 
 def open_data(root: str, format: Optional[str] = None, **options) -> TwoStateData:
-    """The data module for a scene folder; the format is found from the folder if not given. Raises UserError where it cannot be."""
+    """The data module for a scene folder; the format is found from the folder if not given. Raises UserError where it
+    cannot be."""
     from p2gs.data.layouts import detect_format
 
     format = format or detect_format(Path(root))

@@ -17,7 +17,8 @@ TYPES = {"r": "revolute", "p": "prismatic"}
 
 @dataclass(frozen=True)
 class BenchmarkObject:
-    """One object of a published benchmark. joints: revolute or prismatic, in the ground truth's order.  column: its name in the paper."""
+    """One object of a published benchmark. joints: revolute or prismatic, in the ground truth's order.  column: its
+    name in the paper."""
 
     id: str
     benchmark: str
@@ -61,7 +62,8 @@ def benchmarks() -> dict[str, tuple[BenchmarkObject, ...]]:
 
 
 def pick_objects(names: Iterable[str]) -> list[BenchmarkObject]:
-    """Objects by benchmark (``paris``, ``all``) or by id, in that order, each once. Raises UserError for an unknown name."""
+    """Objects by benchmark (``paris``, ``all``) or by id, in that order, each once. Raises UserError for an unknown
+    name."""
     lists = benchmarks()
     every = {o.id: o for group in lists.values() for o in group}
     found: dict[str, BenchmarkObject] = {}
@@ -96,7 +98,8 @@ def scene_folders(root: Path) -> list[Path]:
 def find_objects(root: Path | str, objects: Iterable[BenchmarkObject]) -> dict[str, Location]:
     """Where each object lies in a downloaded tree: a scene folder of its name, or a source below a ``load`` folder.
 
-    Missing ones are left out. Of an object that is there several times the ArtGS layout is taken (it has depth), then DTA's, then PARIS's.
+    Missing ones are left out. Of an object that is there several times the ArtGS layout is taken (it has depth), then
+    DTA's, then PARIS's.
     """
     from p2gs.data.layouts import detect_format
     from p2gs.data.paris import sources

@@ -1,7 +1,9 @@
-"""The PARIS layout: ``load/<source>/{start,end}/{train,val,test}/NNNN.png`` (RGBA) with ``camera_{train,val,test}.json``.
+"""The PARIS layout: ``load/<source>/{start,end}/{train,val,test}/NNNN.png`` (RGBA) with
+``camera_{train,val,test}.json``.
 
-A camera file is a flat dict: ``"K"`` 3x3 and frame name -> 4x4 camera-to-world in OpenGL axes. The whole K is used, principal
-point included (PARIS itself reads fx only and centres the rest). There is no depth. Format: PARIS, datasets/blender_paris.py.
+A camera file is a flat dict: ``"K"`` 3x3 and frame name -> 4x4 camera-to-world in OpenGL axes. The whole K is used,
+principal point included (PARIS itself reads fx only and centres the rest). There is no depth. Format: PARIS,
+datasets/blender_paris.py.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ def sources(root: Path) -> list[str]:
 
 
 def detect(root: Path) -> bool:
-    """Whether the folder looks like this layout (``load/...``, or already the inner folder with start/camera_train.json)."""
+    """Whether the folder looks like this layout (``load/...``, or already the inner folder with
+    start/camera_train.json)."""
     return (root / "load").is_dir() or any((root / s / "camera_train.json").is_file() for s in STATES)
 
 
@@ -107,6 +110,8 @@ def index(root: Path, report: Report, source: Optional[str] = None) -> list[Fram
                     frames.append(Frame(name, state, split, image, viewmat, K=K, K_source=camera_file))
             unposed = sorted(p.stem for p in folder.glob("*.png") if p.stem not in cameras) if folder.is_dir() else []
             if unposed:
-                report.note(f"{camera_file}: {len(unposed)} images have no camera frame and are left out, the first is {unposed[0]}.png")
+                report.note(
+                    f"{camera_file}: {len(unposed)} images have no camera frame and are left out, the first is {unposed[0]}.png"
+                )
     check_frames(frames, root, report)
     return frames

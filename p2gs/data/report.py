@@ -24,7 +24,8 @@ class Finding:
 class Report:
     """Collects findings in the order in which they are met.
 
-    root: the scene's folder, out of which files should not lead (None: anything may be read).  strict: those that do are errors.
+    root: the scene's folder, out of which files should not lead (None: anything may be read).  strict: those that do
+    are errors.
     """
 
     findings: list[Finding] = field(default_factory=list)
@@ -45,13 +46,14 @@ class Report:
             self.error(finding.message) if finding.level == "error" else self.note(finding.message)
 
     def may_read(self, path: Path) -> bool:
-        """Whether a file may be opened; asked before it is. One that leads out of the root (``..``, an absolute path, a link) is named,
-        once for each folder that such files lie in; where ``strict``, it is an error and False."""
+        """Whether a file may be opened; asked before it is. One that leads out of the root (``..``, an absolute path, a
+        link) is named, once for each folder that such files lie in; where ``strict``, it is an error and False."""
         try:
             real = path.resolve()
             self.opened.add(real)
             inside = self.root is None or real.is_relative_to(self.root.resolve())
-        except (OSError, ValueError, RuntimeError):  # a ring of links, a name that no file can have: there is nothing to read
+        # a ring of links, a name that no file can have: there is nothing to read
+        except (OSError, ValueError, RuntimeError):
             return True
         if inside:
             return True

@@ -1,4 +1,5 @@
-"""What training looks at: each view at several sizes, cropped to the object, ready to be composited over any background.
+"""What training looks at: each view at several sizes, cropped to the object, ready to be composited over any
+background.
 
 Pixels are kept premultiplied in uint8 and become float per request, so a scene of 128 views stays under 100 MB.
 """
@@ -34,8 +35,8 @@ def view_index(seed: int, step: int, n_views: int) -> int:
 class TargetImage:
     """A cropped, scaled photograph and the camera that renders it.
 
-    image: [H, W, 3] float32 composited over the background.  alpha: [H, W] float32.  depth: [H, W] float32 along the camera's z,
-    0 where unknown, or None.  key: the same for the same (view, size, crop), hashable.
+    image: [H, W, 3] float32 composited over the background.  alpha: [H, W] float32.  depth: [H, W] float32 along the
+    camera's z, 0 where unknown, or None.  key: the same for the same (view, size, crop), hashable.
     """
 
     image: Tensor
@@ -54,8 +55,11 @@ class _Stored:
     key: tuple
 
 
-def crop_window(bounds: tuple[int, int, int, int], width: int, height: int, margin: int, align: int) -> tuple[int, int, int, int]:
-    """(x, y, w, h) around bounds (x0, y0, x1, y1) plus margin, w and h multiples of ``align`` where the image is wide enough."""
+def crop_window(
+    bounds: tuple[int, int, int, int], width: int, height: int, margin: int, align: int
+) -> tuple[int, int, int, int]:
+    """(x, y, w, h) around bounds (x0, y0, x1, y1) plus margin, w and h multiples of ``align`` where the image is wide
+    enough."""
 
     def span(lo: int, hi: int, size: int) -> tuple[int, int]:
         lo, hi = max(lo - margin, 0), min(hi + margin, size)
@@ -70,14 +74,19 @@ def crop_window(bounds: tuple[int, int, int, int], width: int, height: int, marg
 class TrainingViews:
     """Views as a pyramid of cropped uint8 images.
 
-    views: as read (any image sizes).  levels: long edge in pixels per pyramid level, in the order in which ``get`` counts them; a
-    level above a view's own size holds that view at its own size.  margin: pixels around the mask's bounding box at the finest
-    level, as a share of the long edge.  align: crops' width and height are multiples of it (the rasteriser's tile).
-    crop=False keeps whole images.
+    views: as read (any image sizes).  levels: long edge in pixels per pyramid level, in the order in which ``get``
+    counts them; a level above a view's own size holds that view at its own size.  margin: pixels around the mask's
+    bounding box at the finest level, as a share of the long edge.  align: crops' width and height are multiples of it
+    (the rasteriser's tile). crop=False keeps whole images.
     """
 
     def __init__(
-        self, views: Sequence[View], levels: Sequence[int] = (100, 200, 400), margin: float = 0.03, align: int = 16, crop: bool = True
+        self,
+        views: Sequence[View],
+        levels: Sequence[int] = (100, 200, 400),
+        margin: float = 0.03,
+        align: int = 16,
+        crop: bool = True,
     ):
         self.levels = tuple(levels)
         self._stored = [self._pyramid(v, margin, align, crop) for v in views]
@@ -117,7 +126,8 @@ class TrainingViews:
         )
 
     def spread(self, count: int) -> list[int]:
-        """Indices of ``count`` views, evenly from the first to the last (of one: the first); of all views where there are no more."""
+        """Indices of ``count`` views, evenly from the first to the last (of one: the first); of all views where there
+        are no more."""
         return torch.linspace(0, len(self) - 1, min(count, len(self))).round().long().tolist()
 
     def camera(self, index: int, level: int) -> Camera:
@@ -125,7 +135,8 @@ class TrainingViews:
         return self._stored[index][level].camera
 
     def get(self, index: int, level: int, background: Tensor) -> TargetImage:
-        """View ``index`` at pyramid level ``level`` composited over ``background`` [3] (float32, 0..1): c + (1 - alpha) * background."""
+        """View ``index`` at pyramid level ``level`` composited over ``background`` [3] (float32, 0..1): c + (1 - alpha)
+        * background."""
         s = self._stored[index][level]
         image, alpha = compose(s.colour, s.alpha, background)
         return TargetImage(image, alpha, s.depth, s.key, s.camera)

@@ -1,4 +1,5 @@
-"""Every stage's own measure, from what the stages handed over and the photographs; no ground truth, the same for a resumed run.
+"""Every stage's own measure, from what the stages handed over and the photographs; no ground truth, the same for a
+resumed run.
 
 Lengths are in the input's units, angles in degrees.
 """
@@ -13,11 +14,18 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
+from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
-from p2gs.models.canonical import carry, with_static
+from p2gs.gaussians.pose import carry, with_static
 from p2gs.models.finish import FinishRecord
-from p2gs.models.single_state import render_gaussians
-from p2gs.motion.joint_confidence import ON_SURFACE, CrossViews, common_level, measure_joints, measuring_level, state_depth
+from p2gs.motion.joint_confidence import (
+    ON_SURFACE,
+    CrossViews,
+    common_level,
+    measure_joints,
+    measuring_level,
+    state_depth,
+)
 from p2gs.ops import se3
 from p2gs.types import ArticulatedObject, GaussianTensors
 from p2gs.visibility.depth_stack import DepthStack, classify
@@ -29,7 +37,8 @@ FOG = (0.1, 0.9)  # opacities that are neither air nor surface
 
 @dataclass
 class StageResults:
-    """What the stages handed over. found_in: the states as discovery had them.  motions: None where the run started without discovery.
+    """What the stages handed over. found_in: the states as discovery had them.  motions: None where the run started
+    without discovery.
     states: as the stages after it had them (the same Gaussians, sharpened).  notes: lines about vanished slots."""
 
     found_in: list[StateGaussians]
@@ -54,10 +63,16 @@ def diagnose(
 ) -> dict:
     """What RUN/diagnostics.json holds, without verdicts and losses.
 
-    views: photographs by state.  min_margin: labels less clear than this count as ambiguous.  backend, twin_backend: as of ``finish``; the
-    latter drew the states before they were sharpened, too.
+    views: photographs by state.  min_margin: labels less clear than this count as ambiguous.  backend, twin_backend: as
+    of ``finish``; the latter drew the states before they were sharpened, too.
     """
-    states, motions, canonical, learned, record = stages.states, stages.motions, stages.canonical, stages.learned, stages.record
+    states, motions, canonical, learned, record = (
+        stages.states,
+        stages.motions,
+        stages.canonical,
+        stages.learned,
+        stages.record,
+    )
     first = {"backend": twin_backend or backend, "device": device}
     unit = 1.0 / twin.similarity.scale
     render = {"backend": backend, "device": device}
@@ -85,14 +100,17 @@ def diagnose(
         if row["disagreement"] is not None:
             row["disagreement"] *= unit
         d["joints"].append(row)
-    for row, slot, earlier in zip(d["joints"], record.slots, trace(states, motions, record, views, stacks, coarse, render), strict=True):
+    for row, slot, earlier in zip(
+        d["joints"], record.slots, trace(states, motions, record, views, stacks, coarse, render), strict=True
+    ):
         row |= {"slot": slot, "confidence_by_stage": {**earlier, "finish": row["confidence"]}}
     return plain(d)
 
 
 def residuals(states, record: FinishRecord, views, level: int, render: dict) -> dict:
-    """Each state's Gaussians in the other state's photographs: mean residual of the static part, and the share of the object's pixels where
-    it is plainly wrong. What only one state shows (a cupboard's inside) is wrong one way; a moving piece that was left static both ways."""
+    """Each state's Gaussians in the other state's photographs: mean residual of the static part, and the share of the
+    object's pixels where it is plainly wrong. What only one state shows (a cupboard's inside) is wrong one way; a
+    moving piece that was left static both ways."""
     out = {}
     for s, name in enumerate(("start_to_end", "end_to_start")):
         T = record.after if s == 0 else se3.inverse(record.after)
@@ -102,8 +120,8 @@ def residuals(states, record: FinishRecord, views, level: int, render: dict) -> 
 
 
 def trace(states, motions, record: FinishRecord, views, stacks, level: int, render: dict) -> list[dict[str, float]]:
-    """Per joint of the twin the confidence it would have had as discovery and as the articulation phase handed it over, on fewer
-    photographs and without the two directions: where it falls, a stage lost the joint."""
+    """Per joint of the twin the confidence it would have had as discovery and as the articulation phase handed it over,
+    on fewer photographs and without the two directions: where it falls, a stage lost the joint."""
     slots = [k - 1 for k in record.slots]
     if not slots:
         return []
@@ -114,13 +132,18 @@ def trace(states, motions, record: FinishRecord, views, stacks, level: int, rend
         found = measure_joints(states, motions.labels, motions.transforms, motions.types, views, stacks, **options)
         for row, slot in zip(out, slots, strict=True):
             row["discovery"] = found[slot].confidence
-    for row, e in zip(out, measure_joints(states, record.labels, record.before, types, views, stacks, **options), strict=True):
+    for row, e in zip(
+        out, measure_joints(states, record.labels, record.before, types, views, stacks, **options), strict=True
+    ):
         row["articulation"] = e.confidence
     return out
 
 
-def reconstruction(g: GaussianTensors, views: TrainingViews, level: int, count: int = 8, backend: str = "auto", device="cpu") -> dict:
-    """A state against its own photographs (PSNR over grey, alpha IoU over ``count`` of them) and the share of fog among its Gaussians."""
+def reconstruction(
+    g: GaussianTensors, views: TrainingViews, level: int, count: int = 8, backend: str = "auto", device="cpu"
+) -> dict:
+    """A state against its own photographs (PSNR over grey, alpha IoU over ``count`` of them) and the share of fog among
+    its Gaussians."""
     grey = torch.full((3,), 0.5)
     squared = pixels = both = either = 0.0
     picked = views.spread(count)
@@ -142,7 +165,8 @@ def reconstruction(g: GaussianTensors, views: TrainingViews, level: int, count: 
 
 
 def motion_evidence(motions: PartMotions, states: list[StateGaussians]) -> dict:
-    """Surface points of each state that were seen to have moved, to have stayed, or neither; what of the moved ones no part took."""
+    """Surface points of each state that were seen to have moved, to have stayed, or neither; what of the moved ones no
+    part took."""
     counted = motions.diagnostics.get("states", [{}, {}])
     out = {}
     for s, name in enumerate(STATES):
@@ -156,15 +180,20 @@ def motion_evidence(motions: PartMotions, states: list[StateGaussians]) -> dict:
 
 
 def evidence_points(motions: PartMotions, state: StateGaussians) -> tuple[Tensor, Optional[Tensor]]:
-    """Indices of the Gaussians discovery looked at and what it saw of each: 1 moved, 0 static, -1 unknown (None: not recorded)."""
-    solid = (torch.sigmoid(state.gaussians.opacity_logits) > motions.diagnostics.get("min_opacity", 0.5)).nonzero().squeeze(1)
+    """Indices of the Gaussians discovery looked at and what it saw of each: 1 moved, 0 static, -1 unknown (None: not
+    recorded)."""
+    solid = (
+        (torch.sigmoid(state.gaussians.opacity_logits) > motions.diagnostics.get("min_opacity", 0.5))
+        .nonzero()
+        .squeeze(1)
+    )
     kept = motions.diagnostics.get("evidence")
     return solid, None if kept is None else kept[state.state].long()
 
 
 def discovery(motions: PartMotions, unit: float) -> dict:
-    """Explanations that were compared, with their image losses; parts that were dropped or merged, with the reason; what was tried when the
-    best was reconsidered."""
+    """Explanations that were compared, with their image losses; parts that were dropped or merged, with the reason;
+    what was tried when the best was reconsidered."""
     told = motions.diagnostics
     return {
         "chosen": told.get("explanation"),
@@ -186,8 +215,9 @@ def amount(kind: str, T: Tensor, unit: float) -> dict:
 
 
 def labelling(state: StateGaussians, record: FinishRecord, s: int, min_margin: float, other: DepthStack) -> dict:
-    """Gaussians by part, the share of the solid ones whose label is too unclear for the polish, and of those that ``other``, the other
-    state's rendered depth, says have moved (how many, and the share that is called static all the same)."""
+    """Gaussians by part, the share of the solid ones whose label is too unclear for the polish, and of those that
+    ``other``, the other state's rendered depth, says have moved (how many, and the share that is called static all the
+    same)."""
     solid = torch.sigmoid(state.gaussians.opacity_logits) > 0.5
     labels, margin = record.labels[s][solid], record.margin[s][solid]
     count = torch.bincount(labels, minlength=len(record.after) + 1).tolist()
@@ -197,11 +227,18 @@ def labelling(state: StateGaussians, record: FinishRecord, s: int, min_margin: f
     moved = classify(free, on)[0]
     left = float((labels[moved] == 0).float().mean()) if bool(moved.any()) else 0.0
     unclear = float(unclear.float().mean()) if len(margin) else 0.0
-    return {"gaussians": count, "ambiguous": unclear, "ambiguous_by_part": shares, "moved": int(moved.sum()), "moved_static": left}
+    return {
+        "gaussians": count,
+        "ambiguous": unclear,
+        "ambiguous_by_part": shares,
+        "moved": int(moved.sum()),
+        "moved_static": left,
+    }
 
 
 def fusion(canonical: CanonicalGaussians, time: float) -> dict:
-    """How many Gaussians each state gave a partner, what free space took away, and what became of openings (None: not looked at)."""
+    """How many Gaussians each state gave a partner, what free space took away, and what became of openings (None: not
+    looked at)."""
     parts = len(canonical.betas)
     count = torch.bincount(canonical.labels, minlength=parts)
     matched = torch.bincount(canonical.labels[canonical.paired], minlength=parts)
@@ -217,10 +254,14 @@ def fusion(canonical: CanonicalGaussians, time: float) -> dict:
 
 
 def articulation(states, motions, canonical, learned, views, unit: float, render: dict) -> dict:
-    """Image loss of the twin in both states' photographs as fusion handed it over and as it was learned; how far joints went."""
+    """Image loss of the twin in both states' photographs as fusion handed it over and as it was learned; how far joints
+    went."""
     out = {"image_loss_start": None, "image_loss_end": None, "joints": []}
     labels = learned.part_ids
-    after = [carry(learned.gaussians, labels, se3.screw_at(with_static(learned.transforms), s - learned.canonical_time)) for s in (0, 1)]
+    after = [
+        carry(learned.gaussians, labels, se3.screw_at(with_static(learned.transforms), s - learned.canonical_time))
+        for s in (0, 1)
+    ]
     out["image_loss_end"] = own_loss(after, views, render)
     if motions is None or canonical.offsets is not None:
         return out
@@ -228,7 +269,9 @@ def articulation(states, motions, canonical, learned, views, unit: float, render
     before = [carry(canonical.gaussians, canonical.labels, se3.screw_at(T, s - times)) for s in (0, 1)]
     out["image_loss_start"] = own_loss(before, views, render)
     for k, kind in enumerate(learned.types):
-        shift, turn = apart(motions.transforms[k], learned.transforms[k], states[0].gaussians.means[motions.labels[0] == k + 1])
+        shift, turn = apart(
+            motions.transforms[k], learned.transforms[k], states[0].gaussians.means[motions.labels[0] == k + 1]
+        )
         out["joints"].append({"slot": k + 1, "type": kind, "moved_degrees": turn, "moved": shift * unit})
     return out
 
@@ -257,8 +300,8 @@ def apart(a: Tensor, b: Tensor, points: Tensor) -> tuple[float, float]:
 
 
 def polishing(record: FinishRecord, twin: ArticulatedObject, states, unit: float) -> dict:
-    """Image loss of each direction before and after the last refinement, what became a drawer's; per joint what the refinement changed and
-    how the two directions differ."""
+    """Image loss of each direction before and after the last refinement, what became a drawer's; per joint what the
+    refinement changed and how the two directions differ."""
     names = ("start_to_end", "end_to_start")
     out = {n: {w: record.costs[w][i] for w in record.costs} for i, n in enumerate(names)} if record.costs else {}
     out["contents"] = record.contents

@@ -39,18 +39,20 @@ def write_diagnosis(
     twin_backend: str | None = None,
     device="cpu",
 ) -> dict:
-    """Measure, judge, draw and write: what the end of every fit does. Parameters as of ``models.diagnosis.diagnose``, twin in internal
-    units. Returns what the JSON holds."""
+    """Measure, judge, draw and write: what the end of every fit does. Parameters as of ``models.diagnosis.diagnose``,
+    twin in internal units. Returns what the JSON holds."""
     d = diagnose(stages, twin, views, min_margin=min_margin, backend=backend, twin_backend=twin_backend, device=device)
     strips = diagnostic_strips(stages, twin, views, min_margin, backend)
     return write_diagnostics(run_dir, d, strips, INTERNAL_DIAGONAL / twin.similarity.scale)
 
 
-def write_diagnostics(run_dir: Path | str, diagnosis: dict, strips: Sequence[tuple[str, str, np.ndarray]], diagonal: float) -> dict:
+def write_diagnostics(
+    run_dir: Path | str, diagnosis: dict, strips: Sequence[tuple[str, str, np.ndarray]], diagonal: float
+) -> dict:
     """Both files; returns what the JSON holds.
 
-    diagnosis: of ``models.diagnosis.diagnose``.  strips: (stage, text, picture).  diagonal: of the object's box, input units. Losses at
-    the start and end of each training stage come from RUN/logs (left out where nothing was logged).
+    diagnosis: of ``models.diagnosis.diagnose``.  strips: (stage, text, picture).  diagonal: of the object's box, input
+    units. Losses at the start and end of each training stage come from RUN/logs (left out where nothing was logged).
     """
     run_dir = Path(run_dir)
     said = verdicts(diagnosis, diagonal)
@@ -77,13 +79,18 @@ def losses(logs: Path) -> dict[str, dict[str, list[float]]]:
 def page(d: dict, strips: Sequence[tuple[str, str, np.ndarray]], name: str) -> str:
     """One self-contained HTML page."""
     css = resources.files("p2gs.export").joinpath("report.css").read_text()
-    body = [f"<h1>{html.escape(name)}: diagnosis</h1>", '<p class="lead">What each stage says of itself, without ground truth.</p>']
+    body = [
+        f"<h1>{html.escape(name)}: diagnosis</h1>",
+        '<p class="lead">What each stage says of itself, without ground truth.</p>',
+    ]
     body += ["<h2>Verdict</h2>", _verdict(d)]
     for stage in STAGES:
         body += [f'<h2 id="{stage}">{TITLES[stage]}</h2>', *SECTIONS[stage](d)]
         for where, text, picture in strips:
             if where == stage:
-                body.append(f'<img src="{png(picture)}" alt="{html.escape(text)}"><p class="soft">{html.escape(text)}</p>')
+                body.append(
+                    f'<img src="{png(picture)}" alt="{html.escape(text)}"><p class="soft">{html.escape(text)}</p>'
+                )
     rows = [[f"<code>{n}</code>", f"{v['value']:g}", html.escape(v["why"])] for n, v in d["limits"].items()]
     body += ["<h2>Limits of the verdict</h2>", table(["measure", "limit", ""], rows)]
     return (
@@ -108,7 +115,11 @@ def png(picture: np.ndarray) -> str:
 
 def _verdict(d: dict) -> str:
     first = d["lost_at"]
-    head = f'<p>The first stage with a warning: <a href="#{first}">{TITLES[first].lower()}</a>.</p>' if first else "<p>No warnings.</p>"
+    head = (
+        f'<p>The first stage with a warning: <a href="#{first}">{TITLES[first].lower()}</a>.</p>'
+        if first
+        else "<p>No warnings.</p>"
+    )
     items = []
     for v in d["verdict"]:
         text = f"{TITLES[v['stage']]}: {html.escape(v['text'])}"
@@ -118,34 +129,67 @@ def _verdict(d: dict) -> str:
 
 def _single(d: dict) -> list[str]:
     rows = [
-        [k, f"{s['psnr']:.1f}", f"{s['psnr_sharpened']:.1f}", f"{s['alpha_iou']:.3f}", f"{s['gaussians']:,}", f"{s['fog']:.0%}"]
+        [
+            k,
+            f"{s['psnr']:.1f}",
+            f"{s['psnr_sharpened']:.1f}",
+            f"{s['alpha_iou']:.3f}",
+            f"{s['gaussians']:,}",
+            f"{s['fog']:.0%}",
+        ]
         for k, s in d["single_state"].items()
     ]
-    return [table(["state", "PSNR, training views [dB]", "sharpened", "silhouette IoU", "Gaussians", "half-transparent"], rows)]
+    return [
+        table(
+            ["state", "PSNR, training views [dB]", "sharpened", "silhouette IoU", "Gaussians", "half-transparent"], rows
+        )
+    ]
 
 
 def _discovery(d: dict) -> list[str]:
     out = []
     if d["motion_evidence"] is not None:
         keys = ("moved", "static", "unknown")
-        rows = [[k, *(_count(s[n]) for n in keys), _share(s.get("moved_without_part"))] for k, s in d["motion_evidence"].items()]
+        rows = [
+            [k, *(_count(s[n]) for n in keys), _share(s.get("moved_without_part"))]
+            for k, s in d["motion_evidence"].items()
+        ]
         out.append(table(["state", "moved", "static", "unknown", "moved, but in no part"], rows))
     found = d["discovery"]
     if found is not None:
         rows = []
         for i, e in enumerate(found["explanations"]):
             tried = e.get("reductions", [])
-            gone = ", ".join(f"{r['change']} {r['type']} ({r['cost_with']:.4f} to {r['cost_without']:.4f})" for r in tried)
+            gone = ", ".join(
+                f"{r['change']} {r['type']} ({r['cost_with']:.4f} to {r['cost_without']:.4f})" for r in tried
+            )
             mark = "chosen" if i == found["chosen"] else ""
             rows.append(
-                [str(i + 1), f"{e['cost']:.4f}", f"{e['rank']:.3f}", mark, f"{', '.join(e.get('types', []))}{'; ' * bool(gone)}{gone}"]
+                [
+                    str(i + 1),
+                    f"{e['cost']:.4f}",
+                    f"{e['rank']:.3f}",
+                    mark,
+                    f"{', '.join(e.get('types', []))}{'; ' * bool(gone)}{gone}",
+                ]
             )
         out.append(
-            table(["explanation", "image loss", "energy", "", "parts; what was dropped or merged (image loss with it, without it)"], rows)
+            table(
+                [
+                    "explanation",
+                    "image loss",
+                    "energy",
+                    "",
+                    "parts; what was dropped or merged (image loss with it, without it)",
+                ],
+                rows,
+            )
         )
         tried = [t for t in found.get("reconsidered", []) if "energy" in t and "after" in t]
         if tried:
-            rows = [[t["change"], t["type"], f"{t['cost']:.4f}", f"{t['after']:.4f}", f"{t['energy']:+.4f}"] for t in tried]
+            rows = [
+                [t["change"], t["type"], f"{t['cost']:.4f}", f"{t['after']:.4f}", f"{t['energy']:+.4f}"] for t in tried
+            ]
             out.append(table(["tried on the chosen one", "type", "image loss", "with it", "energy"], rows))
         rows = [[f"{p['part']}", p["type"], _amount(p), f"{p['confidence']:.2f}"] for p in found["parts"]]
         out.append(table(["part of discovery", "type", "start to end", "share explained"], rows))
@@ -153,13 +197,21 @@ def _discovery(d: dict) -> list[str]:
         [k, " + ".join(map(str, s["gaussians"])), _share(s["ambiguous"]), f"{s['moved']:,}", _share(s["moved_static"])]
         for k, s in d["labels"].items()
     ]
-    head = ["state, as labelled in the twin", "solid Gaussians by part", "unclear labels", "seen to have moved", "of them static"]
+    head = [
+        "state, as labelled in the twin",
+        "solid Gaussians by part",
+        "unclear labels",
+        "seen to have moved",
+        "of them static",
+    ]
     return [*out, table(head, rows)]
 
 
 def _fusion(d: dict) -> list[str]:
     f = d["fusion"]
-    rows = [[f"{chip(k)}{k}", f"{n:,}", f"{m:,}"] for k, (n, m) in enumerate(zip(f["gaussians"], f["matched"], strict=True))]
+    rows = [
+        [f"{chip(k)}{k}", f"{n:,}", f"{m:,}"] for k, (n, m) in enumerate(zip(f["gaussians"], f["matched"], strict=True))
+    ]
     text = f"canonical time {f['canonical_time']:.3f}; contradicted by free space: "
     text += f"relabelled {_count(f['relabelled'])}, dropped {_count(f['dropped'])}"
     if any(f.get("owners") or []):
@@ -167,13 +219,18 @@ def _fusion(d: dict) -> list[str]:
     for state, o in zip(("start", "end"), f.get("openings") or [], strict=False):
         text += f"; {state}: {o['unconfirmed']:,} that the other state says nothing of, {o['removed']:,} gave way to the walls behind"
         text += f" and {o['boards']} boards before these" if o.get("boards") else ""
-    return [table(["part of discovery", "Gaussians", "with a partner in the other state"], rows), f'<p class="soft">{text}</p>']
+    return [
+        table(["part of discovery", "Gaussians", "with a partner in the other state"], rows),
+        f'<p class="soft">{text}</p>',
+    ]
 
 
 def _articulation(d: dict) -> list[str]:
     a = d["articulation"]
     rows = [["mean difference to photographs", _number(a["image_loss_start"]), _number(a["image_loss_end"])]]
-    rows += [[f"loss {html.escape(n)}", _number(v[0]), _number(v[1])] for n, v in d["losses"].get("articulation", {}).items()]
+    rows += [
+        [f"loss {html.escape(n)}", _number(v[0]), _number(v[1])] for n, v in d["losses"].get("articulation", {}).items()
+    ]
     return [table(["", "start", "end"], rows)]
 
 
@@ -185,9 +242,13 @@ def _finish(d: dict) -> list[str]:
         rows = [[k.replace("_", " "), _number(w["before"]), _number(w["after"])] for k, w in ways]
         out.append(table(["image loss", "before the polish", "after"], rows))
     if p["contents"]:
-        out.append(f'<p class="soft">{p["contents"]:,} Gaussians became a drawer\'s: they are on or in its open tray</p>')
+        out.append(
+            f'<p class="soft">{p["contents"]:,} Gaussians became a drawer\'s: they are on or in its open tray</p>'
+        )
     rows = [[k.replace("_", " "), _number(r["static"]), _share(r["bright_static"])] for k, r in d["residuals"].items()]
-    out.append(table(["moved into the other state", "residual of the static part", "of the object wrong though static"], rows))
+    out.append(
+        table(["moved into the other state", "residual of the static part", "of the object wrong though static"], rows)
+    )
     polish = {j["part"]: j for j in p["joints"]}
     rows = []
     for j in d["joints"]:
@@ -196,16 +257,36 @@ def _finish(d: dict) -> list[str]:
         key = ("changed_degrees", "disagreement_degrees") if turned else ("changed", "disagreement")
         unit = "&deg;" if turned else ""
         values = [f"{q[k]:.3f}{unit}" if k in q else "" for k in key]
-        values += [_share(j["coverage"]), _share(j["contradicted"]), _number(j["residual"]), _share(j["rise"]), _share(j["fall"])]
+        values += [
+            _share(j["coverage"]),
+            _share(j["contradicted"]),
+            _number(j["residual"]),
+            _share(j["rise"]),
+            _share(j["fall"]),
+        ]
         stages = j["confidence_by_stage"]
         values += [" &rarr; ".join(f"{c:.2f}" for c in stages.values())]
         rows.append([f"{chip(j['part'])}{j['part']}", j["type"], *values])
-    head = ["part", "type", "changed by polish", "two directions apart", "lands on surface", "lands in free space", "residual / static"]
+    head = [
+        "part",
+        "type",
+        "changed by polish",
+        "two directions apart",
+        "lands on surface",
+        "lands in free space",
+        "residual / static",
+    ]
     out.append(table([*head, "residual rises by", "could fall by", "confidence by stage"], rows))
     return out
 
 
-SECTIONS = {"single_state": _single, "discovery": _discovery, "canonical_fusion": _fusion, "articulation": _articulation, "finish": _finish}
+SECTIONS = {
+    "single_state": _single,
+    "discovery": _discovery,
+    "canonical_fusion": _fusion,
+    "articulation": _articulation,
+    "finish": _finish,
+}
 
 
 def _amount(p: dict) -> str:

@@ -1,4 +1,5 @@
-"""Pictures of every stage's own measure, from photographs and hand-over objects (internal coordinates); strips for the diagnosis page."""
+"""Pictures of every stage's own measure, from photographs and hand-over objects (internal coordinates); strips for the
+diagnosis page."""
 
 from __future__ import annotations
 
@@ -25,9 +26,14 @@ UNCLEAR = (0.85, 0.10, 0.75)
 
 @torch.no_grad()
 def diagnostic_strips(
-    stages: StageResults, twin: ArticulatedObject, views: dict[int, TrainingViews], min_margin: float, backend: str = "auto"
+    stages: StageResults,
+    twin: ArticulatedObject,
+    views: dict[int, TrainingViews],
+    min_margin: float,
+    backend: str = "auto",
 ) -> list[tuple[str, str, np.ndarray]]:
-    """(stage, what the strip shows, uint8 picture [H, W, 3]), the start state above the end state. backend: draws the sharpened states."""
+    """(stage, what the strip shows, uint8 picture [H, W, 3]), the start state above the end state. backend: draws the
+    sharpened states."""
     states, motions, record = stages.found_in, stages.motions, stages.record
     shots = [chosen_shot(states, record, views, s) for s in (0, 1)]
     photos = [to_image(shot.image) for shot in shots]
@@ -35,9 +41,13 @@ def diagnostic_strips(
     for s, (shot, photo) in enumerate(zip(shots, photos, strict=True)):
         name, g = STATES[s], states[s].gaussians
         own = draw(g, shot.camera).colour
-        rows["state"].append([(f"photograph ({name})", photo), ("reconstruction", to_image(own)), ("difference", heat(own, shot))])
+        rows["state"].append(
+            [(f"photograph ({name})", photo), ("reconstruction", to_image(own)), ("difference", heat(own, shot))]
+        )
         cells = [("parts", to_image(draw(part_coloured(g, record.labels[s]), shot.camera).colour))]
-        cells.append(("unclear labels", marked(photo, g, shot.camera, (record.margin[s] < min_margin).long(), {1: UNCLEAR})))
+        cells.append(
+            ("unclear labels", marked(photo, g, shot.camera, (record.margin[s] < min_margin).long(), {1: UNCLEAR}))
+        )
         if motions is not None:
             solid, seen = evidence_points(motions, states[s])
             if seen is not None:
@@ -45,13 +55,20 @@ def diagnostic_strips(
         rows["evidence"].append(cells)
         arrived = moved_here(stages.states[1 - s], record, 1 - s, shot, backend)
         whence = f"{STATES[1 - s]} state moved here"
-        rows["moved"].append([(f"photograph ({name})", photo), (whence, to_image(arrived)), ("difference", heat(arrived, shot))])
+        rows["moved"].append(
+            [(f"photograph ({name})", photo), (whence, to_image(arrived)), ("difference", heat(arrived, shot))]
+        )
         posed = pose(twin, float(s))
         final = draw(posed, shot.camera).colour
         parts = to_image(draw(part_coloured(posed, twin.part_ids), shot.camera).colour)
-        rows["twin"].append([(f"twin ({name})", to_image(final)), ("its parts", parts), ("difference", heat(final, shot))])
+        rows["twin"].append(
+            [(f"twin ({name})", to_image(final)), ("its parts", parts), ("difference", heat(final, shot))]
+        )
     told = {
-        "state": ("single_state", "Each state against a photograph. Bright differences: the reconstruction itself is wrong there."),
+        "state": (
+            "single_state",
+            "Each state against a photograph. Bright differences: the reconstruction itself is wrong there.",
+        ),
         "evidence": (
             "discovery",
             "Red: seen through by the other state's cameras, so it moved; blue: still there; yellow: hidden, says nothing. Parts are what "
@@ -67,16 +84,22 @@ def diagnostic_strips(
 
 
 def chosen_shot(states, record: FinishRecord, views: dict[int, TrainingViews], s: int, looks: int = 12) -> TargetImage:
-    """The photograph of state ``s``, of ``looks`` spread over its views, in which most of every moving part shows; over white."""
+    """The photograph of state ``s``, of ``looks`` spread over its views, in which most of every moving part shows; over
+    white."""
     mine = views[s]
-    coarse, fine = min(range(len(mine.levels)), key=mine.levels.__getitem__), max(range(len(mine.levels)), key=mine.levels.__getitem__)
+    coarse, fine = (
+        min(range(len(mine.levels)), key=mine.levels.__getitem__),
+        max(range(len(mine.levels)), key=mine.levels.__getitem__),
+    )
     moving, parts = record.labels[s] > 0, len(record.after)
     picked = mine.spread(looks)
     best, index = -1.0, picked[0]
     if bool(moving.any()):
         onehot = torch.nn.functional.one_hot(record.labels[s], parts + 1).float()[:, 1:16].contiguous()
         for i in picked:
-            share = draw(states[s].gaussians, mine.camera(i, coarse), features=onehot).features.mean((0, 1)).sqrt().sum()
+            share = (
+                draw(states[s].gaussians, mine.camera(i, coarse), features=onehot).features.mean((0, 1)).sqrt().sum()
+            )
             if float(share) > best:
                 best, index = float(share), i
     return mine.get(index, fine, torch.ones(3))
@@ -86,7 +109,9 @@ def moved_here(state: StateGaussians, record: FinishRecord, s: int, shot: Target
     """Colour [H, W, 3] of a state's Gaussians carried to the other state, over white."""
     body = MovedGaussians(state.gaussians, record.labels[s])
     means, quats, sh = body.moved(record.after if s == 0 else se3.inverse(record.after))
-    return draw(GaussianTensors(means, quats, body.g.log_scales, body.g.opacity_logits, sh), shot.camera, backend=backend).colour
+    return draw(
+        GaussianTensors(means, quats, body.g.log_scales, body.g.opacity_logits, sh), shot.camera, backend=backend
+    ).colour
 
 
 def heat(colour: Tensor, shot: TargetImage) -> np.ndarray:
@@ -97,8 +122,11 @@ def heat(colour: Tensor, shot: TargetImage) -> np.ndarray:
     return cv2.applyColorMap((error * 255).round().to(torch.uint8).numpy(), cv2.COLORMAP_INFERNO)[..., ::-1]
 
 
-def marked(photo: np.ndarray, g: GaussianTensors, camera: Camera, classes: Tensor, colours: dict[int, tuple]) -> np.ndarray:
-    """The photograph in grey with Gaussians of the named classes [N] in their colours; others only hide what is behind them."""
+def marked(
+    photo: np.ndarray, g: GaussianTensors, camera: Camera, classes: Tensor, colours: dict[int, tuple]
+) -> np.ndarray:
+    """The photograph in grey with Gaussians of the named classes [N] in their colours; others only hide what is behind
+    them."""
     paint = torch.zeros(len(g), 4)
     for value, colour in colours.items():
         paint[classes == value] = torch.tensor([*colour, 1.0])
@@ -112,5 +140,8 @@ def strip(rows: list[list[tuple[str, np.ndarray]]]) -> np.ndarray:
     """Captioned pictures in rows and columns."""
     columns = max(map(len, rows))
     blank = ("", np.full((CELL, CELL, 3), 255, np.uint8))
-    lines = [beside([captioned(fit(p, CELL, CELL), text) for text, p in row + [blank] * (columns - len(row))]) for row in rows]
+    lines = [
+        beside([captioned(fit(p, CELL, CELL), text) for text, p in row + [blank] * (columns - len(row))])
+        for row in rows
+    ]
     return np.concatenate(lines)

@@ -1,15 +1,22 @@
-"""What the diagnosis means, in sentences: simple rules over its figures, each with a limit that can be read here and in the page."""
+"""What the diagnosis means, in sentences: simple rules over its figures, each with a limit that can be read here and in
+the page."""
 
 from __future__ import annotations
 
 LIMITS = {
     "psnr": (25.0, "dB: a state that is reconstructed worse gives every later stage wrong surfaces"),
-    "alpha_iou": (0.95, "a silhouette that overlaps the mask by less: cameras or masks are off, or training was too short"),
+    "alpha_iou": (
+        0.95,
+        "a silhouette that overlaps the mask by less: cameras or masks are off, or training was too short",
+    ),
     "fog": (0.7, "share of half-transparent Gaussians above which surfaces are not surfaces"),
     "moved": (30, "surface points that moved, both states together; with fewer there is nothing to find"),
     "moved_without_part": (0.25, "share of the moved surface that no part took: a part may be missing"),
     "moved_static": (0.25, "the same at the end, of the surface that the other state is seen to be empty at"),
-    "bright_static": (0.1, "share of the object that is plainly wrong in both directions though nothing is said to move there"),
+    "bright_static": (
+        0.1,
+        "share of the object that is plainly wrong in both directions though nothing is said to move there",
+    ),
     "close_call": (0.01, "relative difference of image loss below which two explanations cannot be told apart"),
     "ambiguous": (0.4, "share of a part's Gaussians with unclear labels"),
     "matched": (0.05, "share of a part's fused Gaussians with a partner in the other state"),
@@ -20,8 +27,14 @@ LIMITS = {
     "contradicted": (0.1, "share of a part that lands where the other state is seen to be empty"),
     "coverage": (0.3, "share of a part that lands on a surface of the other state"),
     "residual": (4.0, "image residual of a moved part, as a multiple of the static part's"),
-    "rise": (0.005, "growth of the residual when a part is displaced by 1 % of the diagonal: below, images do not hold the joint"),
-    "fall": (0.03, "share by which a small change of the joint lowers the residual: the joint is not at its best place"),
+    "rise": (
+        0.005,
+        "growth of the residual when a part is displaced by 1 % of the diagonal: below, images do not hold the joint",
+    ),
+    "fall": (
+        0.03,
+        "share by which a small change of the joint lowers the residual: the joint is not at its best place",
+    ),
     "confidence": (0.5, "confidence below which a joint is more likely wrong than right"),
 }
 STAGES = ("single_state", "discovery", "canonical_fusion", "articulation", "finish")
@@ -47,7 +60,11 @@ def verdicts(d: dict, diagonal: float) -> list[dict]:
         say("finish", note + ".", "note")
     if not any(v["level"] == "warning" for v in said):
         n = len(d["joints"])
-        say("finish", f"Nothing speaks against the {n} joint{'s' * (n != 1)} that {'was' if n == 1 else 'were'} found.", "note")
+        say(
+            "finish",
+            f"Nothing speaks against the {n} joint{'s' * (n != 1)} that {'was' if n == 1 else 'were'} found.",
+            "note",
+        )
     return sorted(said, key=lambda v: STAGES.index(v["stage"]))
 
 
@@ -64,13 +81,22 @@ def _reconstruction(d: dict, say) -> None:
     for name, s in d["single_state"].items():
         if s["psnr"] < limit("psnr"):
             least = limit("psnr")
-            say("single_state", f"The {name} state is reconstructed poorly: {s['psnr']:.1f} dB on its photographs (below {least:g}).")
+            say(
+                "single_state",
+                f"The {name} state is reconstructed poorly: {s['psnr']:.1f} dB on its photographs (below {least:g}).",
+            )
         if s["alpha_iou"] < limit("alpha_iou"):
             least = limit("alpha_iou")
-            say("single_state", f"The {name} state's silhouette overlaps the masks by {s['alpha_iou']:.2f} only (below {least:g}).")
+            say(
+                "single_state",
+                f"The {name} state's silhouette overlaps the masks by {s['alpha_iou']:.2f} only (below {least:g}).",
+            )
         if s["fog"] > limit("fog"):
             most = limit("fog")
-            say("single_state", f"{s['fog']:.0%} of the {name} state's Gaussians are half-transparent (above {most:.0%}): fog.")
+            say(
+                "single_state",
+                f"{s['fog']:.0%} of the {name} state's Gaussians are half-transparent (above {most:.0%}): fog.",
+            )
 
 
 def _discovery(d: dict, say) -> None:
@@ -80,11 +106,17 @@ def _discovery(d: dict, say) -> None:
         return
     moved = [s["moved"] for s in seen.values() if s.get("moved") is not None]
     if moved and sum(moved) < limit("moved"):
-        say("discovery", f"Next to nothing moved between the states: {sum(moved)} surface points (below {limit('moved')}).")
+        say(
+            "discovery",
+            f"Next to nothing moved between the states: {sum(moved)} surface points (below {limit('moved')}).",
+        )
     for name, s in seen.items():
         loose = s.get("moved_without_part", 0.0)
         if loose > limit("moved_without_part"):
-            say("discovery", f"{loose:.0%} of what moved in the {name} state belongs to no part: a part is missing, or a motion is wrong.")
+            say(
+                "discovery",
+                f"{loose:.0%} of what moved in the {name} state belongs to no part: a part is missing, or a motion is wrong.",
+            )
     if not found["parts"]:
         say("discovery", "No motion explains what moved: no moving part was found.")
     if found["chosen"] is not None and len(found["explanations"]) > 1:
@@ -101,7 +133,11 @@ def _discovery(d: dict, say) -> None:
     for name, s in d["labels"].items():
         for k, share in enumerate(s["ambiguous_by_part"]):
             if k and share > limit("ambiguous"):
-                say("discovery", f"Part {k}: {share:.0%} of its Gaussians in the {name} state have unclear labels.", "note")
+                say(
+                    "discovery",
+                    f"Part {k}: {share:.0%} of its Gaussians in the {name} state have unclear labels.",
+                    "note",
+                )
 
 
 def _static(d: dict, say) -> None:
@@ -123,10 +159,16 @@ def _fusion(d: dict, say) -> None:
     f = d["fusion"]
     for k, (n, m) in enumerate(zip(f["gaussians"], f["matched"], strict=True)):
         if k and m < limit("matched") * n:
-            say("canonical_fusion", f"Part {k} of discovery: {m} of its {n} Gaussians have a partner in the other state.")
+            say(
+                "canonical_fusion",
+                f"Part {k} of discovery: {m} of its {n} Gaussians have a partner in the other state.",
+            )
     removed = (f["relabelled"] or 0) + (f["dropped"] or 0)
     if removed > limit("removed") * (sum(f["gaussians"]) + (f["dropped"] or 0)):
-        say("canonical_fusion", f"{removed} Gaussians were relabelled or dropped because the other state is seen to be empty there.")
+        say(
+            "canonical_fusion",
+            f"{removed} Gaussians were relabelled or dropped because the other state is seen to be empty there.",
+        )
 
 
 def _articulation(d: dict, say) -> None:

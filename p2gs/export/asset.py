@@ -26,7 +26,9 @@ from p2gs.surface.texture import Texture
 from p2gs.types import GaussianTensors, Joint, UserError
 
 DENSITY = 300.0  # kg / m^3 of the convex pieces: chipboard furniture with some air in it
-DENSITIES = {  # kg / m^3 of the collision pieces, which fill a shell's hollow walls: solid materials weigh more than parts made of them
+# kg / m^3 of the collision pieces, which fill a shell's hollow walls: solid materials weigh more than parts made of
+# them
+DENSITIES = {
     "chipboard": DENSITY,  # default
     "wood": 550.0,  # pine, air-dry
     "plastic": 400.0,  # ABS shells of about a third
@@ -65,9 +67,10 @@ class Placement:
 
 @dataclass(frozen=True)
 class Asset:
-    """links[0] is the static base.  blocking: (moving link, other link) that run into each other in one of the other's recorded states, as
-    a door before a drawer does.  lost: share of a link's collision volume that was trimmed to give joints room, by name.  fixed: whether
-    the base stands fast in the world or may fall over; None: as each format has it.  material: one of ``DENSITIES``."""
+    """links[0] is the static base.  blocking: (moving link, other link) that run into each other in one of the other's
+    recorded states, as a door before a drawer does.  lost: share of a link's collision volume that was trimmed to give
+    joints room, by name.  fixed: whether the base stands fast in the world or may fall over; None: as each format has
+    it.  material: one of ``DENSITIES``."""
 
     name: str
     links: list[Link]
@@ -96,11 +99,11 @@ def load_asset(
 ) -> Asset:
     """Read a run (its meshes are made if they are not there) into the target's conventions.
 
-    scale: metres per input unit.  up: axis of the target that points up; the input's is z.  origin: ``keep`` the input's,
-    ``center`` of the object's box, or the middle of its ``bottom``.  solid: with collision pieces and inertia; without, for looking
-    at only, it takes no time.  extend_range: joint limits beyond the observed motion, until pieces touch (only where solid).  texture:
-    makes one of a part's id and mesh (``texture.Baker``).  splats: with each part's Gaussians.  Raises UserError for other values or a run
-    without a twin.
+    scale: metres per input unit.  up: axis of the target that points up; the input's is z.  origin: ``keep`` the
+    input's, ``center`` of the object's box, or the middle of its ``bottom``.  solid: with collision pieces and inertia;
+    without, for looking at only, it takes no time.  extend_range: joint limits beyond the observed motion, until pieces
+    touch (only where solid).  texture: makes one of a part's id and mesh (``texture.Baker``).  splats: with each part's
+    Gaussians.  Raises UserError for other values or a run without a twin.
     """
     if up not in UPS:
         raise UserError(f"--up is '{up}', expected one of {', '.join(UPS)}")
@@ -126,11 +129,14 @@ def load_asset(
     if not solid:
         return Asset(name, links, up)
     cleared = clear_links(links)
-    return Asset(name, extend_links(cleared.links) if extend_range else cleared.links, up, cleared.blocking, cleared.lost)
+    return Asset(
+        name, extend_links(cleared.links) if extend_range else cleared.links, up, cleared.blocking, cleared.lost
+    )
 
 
 def start_box(run_dir: Path | str) -> np.ndarray:
-    """Lower and upper corner [2, 3] of the whole object in the start state, in input units. The meshes are made if they are not there."""
+    """Lower and upper corner [2, 3] of the whole object in the start state, in input units. The meshes are made if they
+    are not there."""
     meshes = read_meshes(run_dir)
     if meshes is None:
         write_meshes(run_dir)
@@ -140,11 +146,20 @@ def start_box(run_dir: Path | str) -> np.ndarray:
 
 
 def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placement:
-    """Where the object stands in the target: an even permutation of the axes turns z up into ``up``, so nothing is mirrored."""
+    """Where the object stands in the target: an even permutation of the axes turns z up into ``up``, so nothing is
+    mirrored."""
     lo, hi = points.min(0), points.max(0)
-    where = {"keep": np.zeros(3), "center": (lo + hi) / 2, "bottom": np.array([(lo[0] + hi[0]) / 2, (lo[1] + hi[1]) / 2, lo[2]])}
+    where = {
+        "keep": np.zeros(3),
+        "center": (lo + hi) / 2,
+        "bottom": np.array([(lo[0] + hi[0]) / 2, (lo[1] + hi[1]) / 2, lo[2]]),
+    }
     # y up as glTF has it: z -> y, y -> -z (the front, -y, looks along +z); x up: the cyclic permutation
-    turns = {"z": np.eye(3), "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])}
+    turns = {
+        "z": np.eye(3),
+        "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+        "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+    }
     return Placement(float(scale), turns[up], where[origin])
 
 
@@ -178,7 +193,9 @@ def make_link(
         hinge = Hinge(joint.type, axis, at, lower, upper, float(joint.motion) * unit, resistance / SETTLE, load)
     name = "base" if joint is None else f"part_{part}"
     colour = tuple(float(c) for c in mesh.colours.mean(0) / 255)
-    return Link(name, part, visual, pieces, inertia, hinge, colour, texture(part, world) if texture else None, closed=closed)
+    return Link(
+        name, part, visual, pieces, inertia, hinge, colour, texture(part, world) if texture else None, closed=closed
+    )
 
 
 def open_note(asset: Asset) -> Optional[str]:

@@ -1,4 +1,5 @@
-"""The mesh files that URDF and MJCF point to: OUT/assets/<link>.obj (visual: vertex colours, textures) and <link>_collision_<i>.obj."""
+"""The mesh files that URDF and MJCF point to: OUT/assets/<link>.obj (visual: vertex colours, textures) and
+<link>_collision_<i>.obj."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ def write_assets(asset: Asset, out: Path) -> None:
         for suffix in (".obj", ".mtl", ".png"):
             old.with_suffix(suffix).unlink(missing_ok=True)
     for link in asset.links:
-        write_obj(folder / visual_name(link), link.visual.vertices, link.visual.faces, link.visual.colours, link.texture)
+        write_obj(
+            folder / visual_name(link), link.visual.vertices, link.visual.faces, link.visual.colours, link.texture
+        )
         for i, piece in enumerate(link.collision):
             write_obj(folder / collision_name(link, i), piece.vertices, piece.faces)
 
@@ -41,9 +44,14 @@ def texture_name(link: Link) -> str:
 
 
 def write_obj(
-    path: Path, vertices: np.ndarray, faces: np.ndarray, colours: Optional[np.ndarray] = None, texture: Optional[Texture] = None
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colours: Optional[np.ndarray] = None,
+    texture: Optional[Texture] = None,
 ) -> None:
-    """Wavefront OBJ; vertex colours as the three extra numbers that MeshLab, Blender and trimesh read; a texture beside it."""
+    """Wavefront OBJ; vertex colours as the three extra numbers that MeshLab, Blender and trimesh read; a texture beside
+    it."""
     rows = vertices if colours is None else np.c_[vertices, colours / 255]
     form = "v " + " ".join(["%.7g"] * 3 + (["%.4f"] * 3 if colours is not None else []))
     with open(path, "w") as file:
@@ -57,14 +65,18 @@ def write_obj(
             _write_rows(file, corners, "f %d %d %d" if colours is None else "f %d//%d %d//%d %d//%d")
             return
         texture.save(path.with_suffix(".png"))
-        path.with_suffix(".mtl").write_text(f"newmtl {path.stem}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {path.stem}.png\n")
+        path.with_suffix(".mtl").write_text(
+            f"newmtl {path.stem}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {path.stem}.png\n"
+        )
         _write_rows(file, texture.uv.reshape(-1, 2), "vt %.7g %.7g")
         file.write(f"usemtl {path.stem}\n")
         corner = np.arange(1, faces.size + 1).reshape(-1, 3)
         if colours is None:
             _write_rows(file, np.stack([faces + 1, corner], 2).reshape(-1, 6), "f %d/%d %d/%d %d/%d")
         else:
-            _write_rows(file, np.stack([faces + 1, corner, faces + 1], 2).reshape(-1, 9), "f %d/%d/%d %d/%d/%d %d/%d/%d")
+            _write_rows(
+                file, np.stack([faces + 1, corner, faces + 1], 2).reshape(-1, 9), "f %d/%d/%d %d/%d/%d %d/%d/%d"
+            )
 
 
 def _write_rows(file: TextIO, rows: np.ndarray, form: str, chunk: int = 4096) -> None:

@@ -98,11 +98,13 @@ def obj(asset: Asset, out: Path) -> Path:
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """scale: metres per input unit.  up: z, y or x, by default what the format expects.  origin: keep, center or bottom.
+    """scale: metres per input unit.  up: z, y or x, by default what the format expects.  origin: keep, center or
+    bottom.
     extend_range: joint limits go on beyond the observed motion until parts touch (twin.json keeps what was observed).
     texture: parts get baked textures in every format but PLY and splats, which know none.
     material: one of ``DENSITIES``, which the masses go by.
-    names: links are called by what they are, which geometry tells but for those given here by part (``naming.with_names``).
+    names: links are called by what they are, which geometry tells but for those given here by part
+    (``naming.with_names``).
     fixed: whether the base stands fast in the world (URDF: on a link ``world``); None: as the format has it.
     splats: USD also has each part's Gaussians.
     """
@@ -130,9 +132,12 @@ class ExportOptions:
 
 
 def own_folder(run_dir: Path | str, out: Optional[Path | str], option: str) -> Path:
-    """``out``, which must be another folder than the run's: other programs read its files by the names base and part_1."""
+    """``out``, which must be another folder than the run's: other programs read its files by the names base and
+    part_1."""
     if out is None or Path(out).resolve() == Path(run_dir).resolve():
-        raise UserError(f"{option}: {run_dir} keeps the names base and part_1 that other programs read; give another folder with --out")
+        raise UserError(
+            f"{option}: {run_dir} keeps the names base and part_1 that other programs read; give another folder with --out"
+        )
     return Path(out)
 
 
@@ -148,10 +153,12 @@ def export_run(
     note: Callable[[str], None] = lambda text: None,
     **options,
 ) -> list[Path]:
-    """Write a finished run in the named formats (``all``: every one) into ``out`` (default the run's folder); returns the files.
+    """Write a finished run in the named formats (``all``: every one) into ``out`` (default the run's folder); returns
+    the files.
 
-    note: told what a user should know of the result.  options: fields of ``ExportOptions``; with ``names``, ``out`` must be another folder
-    than the run's. Raises UserError for an unknown format or material, with the nearest name, and for textures that no named format holds.
+    note: told what a user should know of the result.  options: fields of ``ExportOptions``; with ``names``, ``out``
+    must be another folder than the run's. Raises UserError for an unknown format or material, with the nearest name,
+    and for textures that no named format holds.
     """
     kinds = list(dict.fromkeys(n for f in formats for n in (EXPORTERS if f == "all" else [f])))
     if not kinds:
@@ -159,7 +166,9 @@ def export_run(
     writers = {name: EXPORTERS[name] for name in kinds}
     chosen = ExportOptions(**options)
     if chosen.texture and UNTEXTURED.issuperset(kinds):
-        raise UserError(f"--texture: {', '.join(kinds)} holds vertex colours and no textures; name another format as well, or leave it out")
+        raise UserError(
+            f"--texture: {', '.join(kinds)} holds vertex colours and no textures; name another format as well, or leave it out"
+        )
     if chosen.names is not None:
         out = own_folder(run_dir, out, "--name")
     out = Path(out) if out is not None else Path(run_dir)
@@ -190,10 +199,11 @@ def export_profile(
     note: Callable[[str], None] = lambda text: None,
     **options,
 ) -> list[Path]:
-    """Write a finished run as one simulator takes it, named and textured, into ``out``, another folder than the run's; returns the files.
+    """Write a finished run as one simulator takes it, named and textured, into ``out``, another folder than the run's;
+    returns the files.
 
-    meta: a file of ``metadata.read_meta``.  note, options: as for ``export_run``; a profile sets ``up`` and ``texture`` itself. Raises
-    UserError for an unknown profile, with the nearest name.
+    meta: a file of ``metadata.read_meta``.  note, options: as for ``export_run``; a profile sets ``up`` and ``texture``
+    itself. Raises UserError for an unknown profile, with the nearest name.
     """
     write = PROFILES[profile]
     out = own_folder(run_dir, out, "--profile")

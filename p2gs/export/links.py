@@ -13,14 +13,17 @@ from p2gs.ops.mesh import Mesh
 from p2gs.surface.texture import Texture
 from p2gs.types import GaussianTensors
 
-HOLD = 0.02  # friction of a joint, in the weight that hangs on it: holds where the axis leans by a degree, as found axes do
-LIFT = 3.0  # effort limit of a joint in the weight that hangs on it: a hand or a motor that opens it has that much to spare
+# friction of a joint, in the weight that hangs on it: holds where the axis leans by a degree, as found axes do
+HOLD = 0.02
+# effort limit of a joint in the weight that hangs on it: a hand or a motor that opens it has that much to spare
+LIFT = 3.0
 QUICK = 0.25  # seconds in which a joint may run through its range: a door that is thrown shut; sets the velocity limit
 
 
 @dataclass(frozen=True)
 class Hinge:
-    """A joint in SI units of the target. axis [3] unit, origin [3].  lower, upper, motion: radians or metres, 0 = start state.
+    """A joint in SI units of the target. axis [3] unit, origin [3].  lower, upper, motion: radians or metres, 0 = start
+    state.
 
     damping: N m s / rad or N s / m.  load: N m or N, of the part's weight where it pulls most.
     """
@@ -52,7 +55,8 @@ class Hinge:
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid part at the start state. Geometry is in the link's frame: world axes, origin at the joint's (base: the world's)."""
+    """A rigid part at the start state. Geometry is in the link's frame: world axes, origin at the joint's (base: the
+    world's)."""
 
     name: str
     part: int

@@ -16,9 +16,11 @@ QCODE = re.compile(r"Q[0-9]+")  # Wikidata's identifiers, as SimReady's rule SL.
 
 
 def read_meta(path: Path | str) -> dict[str, Scalar]:
-    """The fields of a YAML or JSON file, for instance ``author``, ``asset_license``, ``category``, ``qcode``, ``asset_name``.
+    """The fields of a YAML or JSON file, for instance ``author``, ``asset_license``, ``category``, ``qcode``,
+    ``asset_name``.
 
-    Raises UserError for a file that is not there or no mapping of names to texts and numbers, and for a malformed ``qcode``.
+    Raises UserError for a file that is not there or no mapping of names to texts and numbers, and for a malformed
+    ``qcode``.
     """
     path = Path(path)
     if not path.is_file():
@@ -32,12 +34,16 @@ def read_meta(path: Path | str) -> dict[str, Scalar]:
     out: dict[str, Scalar] = {}
     for key, value in data.items():
         if not isinstance(key, str) or not KEY.fullmatch(key):
-            raise UserError(f"--meta: {path}: field '{key}': a name is letters, digits and underscores, and no digit comes first")
+            raise UserError(
+                f"--meta: {path}: field '{key}': a name is letters, digits and underscores, and no digit comes first"
+            )
         if isinstance(value, bool) or not isinstance(value, (str, int, float)):
             value = None if value is None else str(value)  # a date, as YAML reads it
         if value is None or value == "":
             raise UserError(f"--meta: {path}: field '{key}' is empty")
         out[key] = value
     if "qcode" in out and not QCODE.fullmatch(str(out["qcode"])):
-        raise UserError(f"--meta: {path}: qcode is '{out['qcode']}', expected Wikidata's identifier of the kind of object, such as Q42177")
+        raise UserError(
+            f"--meta: {path}: qcode is '{out['qcode']}', expected Wikidata's identifier of the kind of object, such as Q42177"
+        )
     return out

@@ -1,6 +1,8 @@
-"""What a part is called: drawer, door, lid, flap, knob, button or wheel, by its joint's type and axis and its shape, or as the user says.
+"""What a part is called: drawer, door, lid, flap, knob, button or wheel, by its joint's type and axis and its shape, or
+as the user says.
 
-The up axis is taken at its word. Where a capture's up is not gravity's, a lid may come out as a flap; ``--name part_1=lid`` says it better.
+The up axis is taken at its word. Where a capture's up is not gravity's, a lid may come out as a flap; ``--name
+part_1=lid`` says it better.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from p2gs.types import UserError
 LABELS = ("drawer", "door", "lid", "flap", "knob", "button", "wheel")  # that geometry tells; a user's may be any
 BODY = "body"  # label of the static part
 ALONG = 0.7  # |cos| above which a direction counts as along another: 45 degrees
-CENTRED = 0.25  # distance of the centre of area from the axis, in the part's radius about it, below which it turns about its middle
+# distance of the centre of area from the axis, in the part's radius about it, below which it turns about its middle
+CENTRED = 0.25
 SMALL = 0.2  # share of the object's diagonal below which a part is for the fingers: a knob, a button
 FLAT = 0.35  # thickness in the second of the three sides below which a part is a panel
 WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")  # what URDF, MJCF and USD all take for a name
@@ -26,7 +29,8 @@ WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")  # what URDF, MJCF and USD all take
 
 @dataclass(frozen=True)
 class Shape:
-    """Area-weighted: centre [3]; principal directions [3, 3] as rows, longest side first, and the sides' lengths [3]."""
+    """Area-weighted: centre [3]; principal directions [3, 3] as rows, longest side first, and the sides' lengths
+    [3]."""
 
     centre: np.ndarray
     axes: np.ndarray
@@ -51,7 +55,8 @@ def surface_points(link: Link) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shut_motion(link: Link, rest: np.ndarray) -> np.ndarray:
-    """Motion [4, 4] from the start to the recorded state in which the part and the rest [N, 3] fill the smaller box: the shut one."""
+    """Motion [4, 4] from the start to the recorded state in which the part and the rest [N, 3] fill the smaller box:
+    the shut one."""
     points = surface_points(link)[0]
 
     def room(T: np.ndarray) -> float:
@@ -91,7 +96,8 @@ def label_of(link: Link, base: Link, up: np.ndarray) -> str:
 
 
 def parse_names(words: Iterable[str]) -> dict[str, str]:
-    """``part_1=door`` of a command line as {"part_1": "door"}. Raises UserError for other words or names that a format would not take."""
+    """``part_1=door`` of a command line as {"part_1": "door"}. Raises UserError for other words or names that a format
+    would not take."""
     out: dict[str, str] = {}
     for word in words:
         part, equals, name = word.partition("=")
@@ -108,17 +114,23 @@ def parse_names(words: Iterable[str]) -> dict[str, str]:
 
 
 def with_names(asset: Asset, given: Optional[Mapping[str, str]] = None) -> Asset:
-    """The asset with labelled links, named by their labels, numbered where several have the same: door, drawer_1, drawer_2.
+    """The asset with labelled links, named by their labels, numbered where several have the same: door, drawer_1,
+    drawer_2.
 
-    given: label of a link by its name (``base``, ``part_1``), which geometry does not overrule. Raises UserError for a link it lacks.
+    given: label of a link by its name (``base``, ``part_1``), which geometry does not overrule. Raises UserError for a
+    link it lacks.
     """
     given = dict(given or {})
     unknown = sorted(set(given) - {link.name for link in asset.links})
     if unknown:
-        raise UserError(f"--name {unknown[0]}: there is no such part; the twin has {', '.join(link.name for link in asset.links)}")
+        raise UserError(
+            f"--name {unknown[0]}: there is no such part; the twin has {', '.join(link.name for link in asset.links)}"
+        )
     up = np.eye(3)["xyz".index(asset.up)]
     base = asset.links[0]
-    labels = [given.get(base.name, BODY)] + [given.get(link.name) or label_of(link, base, up) for link in asset.links[1:]]
+    labels = [given.get(base.name, BODY)] + [
+        given.get(link.name) or label_of(link, base, up) for link in asset.links[1:]
+    ]
     wanted = [given.get(base.name, base.name), *labels[1:]]
     names, taken = [], set(wanted)
     for i, name in enumerate(wanted):
@@ -130,6 +142,8 @@ def with_names(asset: Asset, given: Optional[Mapping[str, str]] = None) -> Asset
             taken.add(name)
         names.append(name)
     renamed = dict(zip((link.name for link in asset.links), names, strict=True))
-    links = [replace(link, name=renamed[link.name], label=label) for link, label in zip(asset.links, labels, strict=True)]
+    links = [
+        replace(link, name=renamed[link.name], label=label) for link, label in zip(asset.links, labels, strict=True)
+    ]
     blocking = [(renamed[a], renamed[b]) for a, b in asset.blocking]
     return replace(asset, links=links, blocking=blocking, lost={renamed[k]: v for k, v in asset.lost.items()})

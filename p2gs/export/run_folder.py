@@ -18,7 +18,8 @@ from p2gs.types import ArticulatedObject, TwoStateScene
 
 
 def write_twin(obj: ArticulatedObject, run_dir: Path | str, scene: TwoStateScene, media: bool = True) -> None:
-    """RUN/splats/{canonical,start,end}.ply, RUN/cameras.json, RUN/media/*.png and, last, RUN/twin.json (its being there says: done).
+    """RUN/splats/{canonical,start,end}.ply, RUN/cameras.json, RUN/media/*.png and, last, RUN/twin.json (its being there
+    says: done).
 
     All in input coordinates, whatever similarity ``obj`` and ``scene`` carry.
     """
@@ -28,7 +29,9 @@ def write_twin(obj: ArticulatedObject, run_dir: Path | str, scene: TwoStateScene
     outer = object_to_input(obj)
     write_splat_ply(run_dir / "splats" / "canonical.ply", outer.gaussians, outer.part_ids)
     for name, t in (("start", 0.0), ("end", 1.0)):
-        write_splat_ply(run_dir / "splats" / f"{name}.ply", gaussians_to_input(pose(outer, t), outer.similarity), outer.part_ids)
+        write_splat_ply(
+            run_dir / "splats" / f"{name}.ply", gaussians_to_input(pose(outer, t), outer.similarity), outer.part_ids
+        )
     cameras = scene_cameras(scene)
     write_cameras(run_dir / "cameras.json", cameras)
     if media:
@@ -38,7 +41,8 @@ def write_twin(obj: ArticulatedObject, run_dir: Path | str, scene: TwoStateScene
 
 
 def remove_derived(run_dir: Path) -> None:
-    """Remove what was made of an earlier twin: its meshes, files for simulators, report and scores would be taken for the new one's."""
+    """Remove what was made of an earlier twin: its meshes, files for simulators, report and scores would be taken for
+    the new one's."""
     names = ("meshes", "assets", "parts", "splats.glb", "report.html", "metrics.json", "slots.json")
     for path in (*run_dir.glob("twin.*"), *(run_dir / name for name in names)):
         if path.is_dir():
@@ -48,7 +52,8 @@ def remove_derived(run_dir: Path) -> None:
 
 
 def complete_run(run_dir: Path | str, formats: Sequence[str] = ("urdf", "mjcf", "glb"), log=print) -> None:
-    """The rest of the result folder: meshes, simulator files and report.html, from what ``write_twin`` left (no dataset needed).
+    """The rest of the result folder: meshes, simulator files and report.html, from what ``write_twin`` left (no dataset
+    needed).
 
     log: told one line a step with its seconds.
     """

@@ -31,8 +31,8 @@ KINDS = {  # m, longest side at the start: generous, a size outside is a wrong u
 
 
 def unlikely_size(longest: float, told: str = "") -> Optional[str]:
-    """A sentence where the longest side [m] is none that such an object has, or any in a household. told: what may name its kind, as a
-    folder or a category does."""
+    """A sentence where the longest side [m] is none that such an object has, or any in a household. told: what may name
+    its kind, as a folder or a category does."""
     name = next((w for w in re.split(r"[^a-z]+", told.lower()) if w in KINDS), "")
     low, high = KINDS.get(name, LIKELY)
     if low <= longest <= high:

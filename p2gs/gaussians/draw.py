@@ -10,7 +10,8 @@ from p2gs.types import Camera, GaussianTensors, RenderOutput
 
 
 def render_gaussians(g: GaussianTensors, camera: Camera, background: Tensor | None = None, **options) -> RenderOutput:
-    """``render.rasterize_stored`` of Gaussians; depth moments are taken about the distance of the origin (the box's centre)."""
+    """``render.rasterize_stored`` of Gaussians; depth moments are taken about the distance of the origin (the box's
+    centre)."""
     sh, sh_rest = (g.sh0, g.sh_rest) if isinstance(g, SplitGaussians) else (g.sh, None)
     return rasterize_stored(
         g.means,

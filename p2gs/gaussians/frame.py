@@ -9,7 +9,8 @@ from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, Part, 
 
 
 def gaussians_to_input(gaussians: GaussianTensors, similarity: Similarity) -> GaussianTensors:
-    """Gaussians in input coordinates. A similarity without rotation leaves quaternions, opacities and SH as they are."""
+    """Gaussians in input coordinates. A similarity without rotation leaves quaternions, opacities and SH as they
+    are."""
     return GaussianTensors(
         similarity.to_input(gaussians.means),
         gaussians.quats,
@@ -45,7 +46,9 @@ def object_to_input(obj: ArticulatedObject) -> ArticulatedObject:
     gaussians = gaussians_to_input(obj.gaussians.detach(), obj.similarity)
     parts = [p if p.joint is None else replace(p, joint=joint_to_input(p.joint, obj.similarity)) for p in obj.parts]
     gaussians = GaussianTensors(*(getattr(gaussians, n).cpu() for n in GaussianTensors.NAMES))
-    return ArticulatedObject(gaussians, obj.part_ids.detach().cpu().long(), parts, float(obj.canonical_time), Similarity())
+    return ArticulatedObject(
+        gaussians, obj.part_ids.detach().cpu().long(), parts, float(obj.canonical_time), Similarity()
+    )
 
 
 def with_counts(obj: ArticulatedObject) -> list[Part]:

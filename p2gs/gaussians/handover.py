@@ -1,4 +1,5 @@
-"""What one phase hands to the next: small named objects, saved as plain tensors (loadable with ``weights_only=True``)."""
+"""What one phase hands to the next: small named objects, saved as plain tensors (loadable with
+``weights_only=True``)."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ from p2gs.types import GaussianTensors
 class ViewCorrections:
     """What was wrong with a state's V training photographs, in the scene's order.
 
-    motions [V, 4, 4] float64, internal units: the camera's viewmat is to be multiplied by it from the right.  log_gains [V, 3]: natural
-    logarithm of how much brighter, in linear light, the photograph is than the state's mean one.
+    motions [V, 4, 4] float64, internal units: the camera's viewmat is to be multiplied by it from the right.  log_gains
+    [V, 3]: natural logarithm of how much brighter, in linear light, the photograph is than the state's mean one.
     """
 
     motions: Tensor
@@ -40,8 +41,8 @@ class StateGaussians:
 class Registration:
     """Where the end state's reconstruction and cameras stand against the start's, as held-out photographs confirmed it.
 
-    transform [4, 4] float64: end -> start, internal units.  log_gain [3]: natural logarithm of how much brighter, in linear light, the
-    end's photographs are.  figures: what was measured, also of what is not applied.
+    transform [4, 4] float64: end -> start, internal units.  log_gain [3]: natural logarithm of how much brighter, in
+    linear light, the end's photographs are.  figures: what was measured, also of what is not applied.
     """
 
     transform: Tensor
@@ -58,8 +59,8 @@ class PartMotions:
     """The rigid motions of a twin's movable parts, start -> end.
 
     types: "revolute" or "prismatic" per movable part (part k is entry k - 1).  transforms [K-1, 4, 4] float64.
-    confidence [K-1] in 0..1.  labels: part ids per Gaussian of the start and end reconstruction, int64.  margin: how clearly
-    each label won, per Gaussian of the two states (internal length units; small = ambiguous).
+    confidence [K-1] in 0..1.  labels: part ids per Gaussian of the start and end reconstruction, int64.  margin: how
+    clearly each label won, per Gaussian of the two states (internal length units; small = ambiguous).
     """
 
     types: list[str]
@@ -73,8 +74,8 @@ class PartMotions:
         return len(self.types)
 
     def with_motion(self, k: int, kind: str, transform: Tensor) -> "PartMotions":
-        """The same with another type and transform [4, 4] for entry ``k``, or with one entry more (k = len; its labels and confidence are
-        not known)."""
+        """The same with another type and transform [4, 4] for entry ``k``, or with one entry more (k = len; its labels
+        and confidence are not known)."""
         types = [*self.types[:k], kind, *self.types[k + 1 :]]
         transforms = torch.cat([self.transforms[:k], transform[None], self.transforms[k + 1 :]])
         return dataclasses.replace(self, types=types, transforms=transforms)
@@ -84,9 +85,11 @@ class PartMotions:
 class CanonicalGaussians:
     """The fused Gaussians at canonical time t_c = 1 - beta.
 
-    betas [K] float64: one per part, all equal unless ``beta: per_part``.  labels [N], margin [N] as in ``PartMotions`` (zero when
-    no parts were discovered).  paired [N] bool: has an observed centre in both states, mu0 and mu1 [N, 3] (zero elsewhere).
-    offsets [N, 2, 3]: position at state 0 and 1 minus canonical position where no motion is known (the paper's chords), else None.
+    betas [K] float64: one per part, all equal unless ``beta: per_part``.  labels [N], margin [N] as in ``PartMotions``
+    (zero when no parts were discovered).  paired [N] bool: has an observed centre in both states, mu0 and mu1 [N, 3]
+    (zero elsewhere).
+    offsets [N, 2, 3]: position at state 0 and 1 minus canonical position where no motion is known (the paper's chords),
+    else None.
     diagnostics: what fusion counted.
     """
 
@@ -110,7 +113,8 @@ class CanonicalGaussians:
 class Articulation:
     """What the articulation phase learned.
 
-    gaussians at ``canonical_time``; probs [N, K] soft part assignment; motions as in ``PartMotions`` (transforms [K-1, 4, 4] start -> end).
+    gaussians at ``canonical_time``; probs [N, K] soft part assignment; motions as in ``PartMotions`` (transforms [K-1,
+    4, 4] start -> end).
     """
 
     gaussians: GaussianTensors
@@ -125,12 +129,21 @@ class Articulation:
         return self.probs.argmax(dim=1)
 
 
-_BUILT_IN = (GaussianTensors, ViewCorrections, StateGaussians, Registration, PartMotions, CanonicalGaussians, Articulation)
+_BUILT_IN = (
+    GaussianTensors,
+    ViewCorrections,
+    StateGaussians,
+    Registration,
+    PartMotions,
+    CanonicalGaussians,
+    Articulation,
+)
 _CLASSES = {c.__name__: c for c in _BUILT_IN}
 
 
 def handed_over(cls: type) -> type:
-    """Decorator for a dataclass that a phase of your own hands over: fields are tensors, numbers, text, lists, dicts or other such classes.
+    """Decorator for a dataclass that a phase of your own hands over: fields are tensors, numbers, text, lists, dicts or
+    other such classes.
 
     Raises ValueError where the class's name is taken.
     """
@@ -143,7 +156,10 @@ def handed_over(cls: type) -> type:
 
 def _pack(value):
     if dataclasses.is_dataclass(value):
-        return {"__class__": type(value).__name__, **{f.name: _pack(getattr(value, f.name)) for f in dataclasses.fields(value)}}
+        return {
+            "__class__": type(value).__name__,
+            **{f.name: _pack(getattr(value, f.name)) for f in dataclasses.fields(value)},
+        }
     if isinstance(value, (list, tuple)):
         return [_pack(v) for v in value]
     if isinstance(value, dict):
@@ -165,16 +181,19 @@ def _unpack(value):
 
 
 def save(value, path: Path, **header) -> None:
-    """Write a hand-over object atomically (a killed run never leaves half a file), sealed. Raises OSError, for a full disk among others."""
+    """Write a hand-over object atomically (a killed run never leaves half a file), sealed. Raises OSError, for a full
+    disk among others."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part, data = path.with_suffix(".part"), io.BytesIO()
-    torch.save({"header": header, "value": _pack(value)}, data)  # into memory: torch tells no reason when a disk is full
+    # into memory: torch tells no reason when a disk is full
+    torch.save({"header": header, "value": _pack(value)}, data)
     part.write_bytes(data.getbuffer())
     seal(part, path)
 
 
 def load(path: Path):
-    """Returns (value, header). Raises ``sealed.Damaged`` for a file that is not as it was written, OSError where it cannot be read."""
+    """Returns (value, header). Raises ``sealed.Damaged`` for a file that is not as it was written, OSError where it
+    cannot be read."""
     check_seal(path)
     try:
         stored = torch.load(path, weights_only=True)

@@ -36,7 +36,8 @@ def drawing_with(rasterizer: str) -> Iterator[str]:
 
 @contextmanager
 def rasterizer_of(run_dir: Path | str) -> Iterator[str]:
-    """Inside, ``draw`` uses the rasterizer that the run's config names, as training did; "auto" for a folder without a config."""
+    """Inside, ``draw`` uses the rasterizer that the run's config names, as training did; "auto" for a folder without a
+    config."""
     with drawing_with(run_rasterizer(run_dir)) as name:
         yield name
 
@@ -47,14 +48,23 @@ def run_rasterizer(run_dir: Path | str) -> str:
 
 
 def draw(
-    g: GaussianTensors, camera: Camera, background: float | Sequence[float] = 1.0, *, backend: str | None = None, **options
+    g: GaussianTensors,
+    camera: Camera,
+    background: float | Sequence[float] = 1.0,
+    *,
+    backend: str | None = None,
+    **options,
 ) -> RenderOutput:
-    """One view of Gaussians that are in the camera's coordinates; background a grey value or RGB. No gradients; results on the CPU.
+    """One view of Gaussians that are in the camera's coordinates; background a grey value or RGB. No gradients; results
+    on the CPU.
 
-    The rasterizer, where none is named, is that of ``rasterizer_of``, if inside one; gsplat gets the tensors on the GPU.
+    The rasterizer, where none is named, is that of ``rasterizer_of``, if inside one; gsplat gets the tensors on the
+    GPU.
     """
     backend = backend or RASTERIZER.get()
-    device = torch.device("cuda") if split_backend(backend)[0] == "gsplat" and torch.cuda.is_available() else g.means.device
+    device = (
+        torch.device("cuda") if split_backend(backend)[0] == "gsplat" and torch.cuda.is_available() else g.means.device
+    )
     colour = torch.as_tensor(background, dtype=torch.float32, device=device).expand(3).contiguous()
     if device != g.means.device:
         g = g.to(device)
@@ -64,7 +74,9 @@ def draw(
             g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh, camera.viewmat, camera.K,
             camera.width, camera.height, background=colour, backend=backend, **options,
         )  # fmt: skip
-    return RenderOutput(**{f.name: v.cpu() if isinstance(v := getattr(out, f.name), Tensor) else v for f in fields(out)})
+    return RenderOutput(
+        **{f.name: v.cpu() if isinstance(v := getattr(out, f.name), Tensor) else v for f in fields(out)}
+    )
 
 
 def to_image(colour: Tensor) -> np.ndarray:
@@ -83,8 +95,8 @@ def part_coloured(g: GaussianTensors, part_ids: Tensor, shading: float = 0.6) ->
 def joint_strokes(obj: ArticulatedObject, part: int, t: float, extent: float) -> list[tuple[np.ndarray, bool]]:
     """World polylines that tell a joint: (points [n, 3], ends in an arrow head).
 
-    Revolute: the axis, and the arc that the part's outer rim runs through from state 0 to 1. Prismatic: an arrow along the
-    motion, off the part's leading end.
+    Revolute: the axis, and the arc that the part's outer rim runs through from state 0 to 1. Prismatic: an arrow along
+    the motion, off the part's leading end.
     """
     joint = obj.parts[part].joint
     mine = (obj.part_ids == obj.parts[part].id) & (torch.sigmoid(obj.gaussians.opacity_logits) > 0.3)
@@ -113,8 +125,11 @@ def joint_strokes(obj: ArticulatedObject, part: int, t: float, extent: float) ->
     return [(line.numpy(), True), (arc.numpy(), True)]
 
 
-def draw_joints(image: np.ndarray, obj: ArticulatedObject, camera: Camera, t: float, depth: Tensor, alpha: Tensor) -> np.ndarray:
-    """The image with every joint drawn over it; strokes behind the surface (depth [H, W]) are thin and pale. ``obj`` as the camera."""
+def draw_joints(
+    image: np.ndarray, obj: ArticulatedObject, camera: Camera, t: float, depth: Tensor, alpha: Tensor
+) -> np.ndarray:
+    """The image with every joint drawn over it; strokes behind the surface (depth [H, W]) are thin and pale. ``obj`` as
+    the camera."""
     import cv2
 
     out = image.copy()
@@ -129,7 +144,8 @@ def draw_joints(image: np.ndarray, obj: ArticulatedObject, camera: Camera, t: fl
         for stroke, arrow in joint_strokes(obj, k, t, extent):
             uv, z = _project(stroke, camera)
             hidden = _hidden(uv, z, surface, 0.02 * extent)
-            # hidden pieces first, pale; then what is in front, on a white rim so that it stands out from a part of its colour
+            # hidden pieces first, pale; then what is in front, on a white rim so that it stands out from a part of its
+            # colour
             faint = _polyline(out, uv, hidden, z, colour, max(1, thick - 1))
             out = cv2.addWeighted(faint, 0.45, out, 0.55, 0)
             if arrow and z[-2:].min() > 1e-3:
@@ -161,7 +177,9 @@ def _arrow_head(image, tail, tip, colour, size) -> None:
     if norm < 1e-6 or not np.isfinite(tip).all():
         return
     d, n = d / norm, np.array([-d[1], d[0]]) / norm
-    corners = np.stack([tip + 0.5 * size * d, tip - 0.5 * size * d + 0.45 * size * n, tip - 0.5 * size * d - 0.45 * size * n])
+    corners = np.stack(
+        [tip + 0.5 * size * d, tip - 0.5 * size * d + 0.45 * size * n, tip - 0.5 * size * d - 0.45 * size * n]
+    )
     cv2.fillConvexPoly(image, np.round(corners * 8).astype(np.int32), colour, cv2.LINE_AA, 3)
 
 
@@ -175,7 +193,8 @@ def _project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray
 
 
 def _hidden(uv, z, surface, margin) -> np.ndarray:
-    """[n] bool: the point lies behind the surface; a majority over neighbours, so that a stroke along a surface does not flicker."""
+    """[n] bool: the point lies behind the surface; a majority over neighbours, so that a stroke along a surface does
+    not flicker."""
     h, w = surface.shape
     u, v = (np.clip(np.round(uv[:, i]).astype(int), 0, n - 1) for i, n in ((0, w), (1, h)))
     behind = (z > surface[v, u] + margin).astype(float)
@@ -188,4 +207,8 @@ def _apply(T: Tensor, x: Tensor) -> Tensor:
 
 def joint_text(joint: Joint) -> str:
     """``revolute 60.0 deg`` or ``prismatic 0.367``."""
-    return f"{joint.type} {abs(joint.motion):.1f} deg" if joint.type == "revolute" else f"{joint.type} {abs(joint.motion):.3f}"
+    return (
+        f"{joint.type} {abs(joint.motion):.1f} deg"
+        if joint.type == "revolute"
+        else f"{joint.type} {abs(joint.motion):.3f}"
+    )

@@ -1,7 +1,8 @@
-"""Files with a checksum at their end, written whole or not at all: a byte that changed on disk is noticed before it is trained on.
+"""Files with a checksum at their end, written whole or not at all: a byte that changed on disk is noticed before it is
+trained on.
 
-The last 40 bytes are ``SEAL`` and the SHA-256 of all before them. What reads zip archives (torch.load does) finds its directory from
-the end and passes over them.
+The last 40 bytes are ``SEAL`` and the SHA-256 of all before them. What reads zip archives (torch.load does) finds its
+directory from the end and passes over them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ class Damaged(Exception):
 
 
 def seal(part: Path, path: Path) -> None:
-    """Append the checksum to ``part``, flush it to disk, and rename it to ``path``. Raises OSError, for a full disk among others."""
+    """Append the checksum to ``part``, flush it to disk, and rename it to ``path``. Raises OSError, for a full disk
+    among others."""
     with open(part, "rb+") as file:
         digest = _digest(file, os.fstat(file.fileno()).st_size)
         file.seek(0, os.SEEK_END)

@@ -1,7 +1,8 @@
 """Gaussians in the binary PLY layout that public splat viewers open, with one more column: ``int part_id``.
 
 Columns: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3 part_id, little-endian float32. ``f_rest`` is
-channel-major (all higher coefficients of red, then green, then blue); opacity is a logit, scale a logarithm, rot is wxyz.
+channel-major (all higher coefficients of red, then green, then blue); opacity is a logit, scale a logarithm, rot is
+wxyz.
 """
 
 from __future__ import annotations
@@ -15,13 +16,40 @@ from torch import Tensor
 
 from p2gs.types import GaussianTensors, UserError
 
-PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
-PLY_TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
+PLY_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+}
+PLY_TYPES |= {
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
 
 
 def splat_dtype(sh_bases: int, with_parts: bool) -> np.dtype:
     """The record of one Gaussian with ``sh_bases`` = (degree+1)^2 coefficients a channel."""
-    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(3 * (sh_bases - 1)))]
+    names = [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * (sh_bases - 1))),
+    ]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     return np.dtype([(n, "<f4") for n in names] + ([("part_id", "<i4")] if with_parts else []))
 
@@ -49,8 +77,8 @@ def write_splat_ply(path: Path | str, gaussians: GaussianTensors, part_ids: Opti
 def read_splat_ply(path: Path | str) -> tuple[GaussianTensors, Optional[Tensor]]:
     """Gaussians and part ids ([N] int64, or None where the file has no such column).
 
-    Columns may come in any order and of any numeric type, as other programs write them. Raises UserError when the file is no
-    binary little-endian PLY, is cut short or lacks a column.
+    Columns may come in any order and of any numeric type, as other programs write them. Raises UserError when the file
+    is no binary little-endian PLY, is cut short or lacks a column.
     """
     rows = _read_vertices(Path(path))
     names = rows.dtype.names or ()
@@ -68,9 +96,15 @@ def read_splat_ply(path: Path | str) -> tuple[GaussianTensors, Optional[Tensor]]
 
     n = len(rows)
     higher = take([f"f_rest_{i}" for i in range(rest)]) if rest else torch.zeros(n, 0)
-    sh = torch.cat([take([f"f_dc_{i}" for i in range(3)])[:, None], higher.reshape(n, 3, rest // 3).transpose(1, 2)], dim=1)
+    sh = torch.cat(
+        [take([f"f_dc_{i}" for i in range(3)])[:, None], higher.reshape(n, 3, rest // 3).transpose(1, 2)], dim=1
+    )
     gaussians = GaussianTensors(
-        take("xyz"), take([f"rot_{i}" for i in range(4)]), take([f"scale_{i}" for i in range(3)]), take(["opacity"])[:, 0], sh.contiguous()
+        take("xyz"),
+        take([f"rot_{i}" for i in range(4)]),
+        take([f"scale_{i}" for i in range(3)]),
+        take(["opacity"])[:, 0],
+        sh.contiguous(),
     )
     ids = torch.from_numpy(rows["part_id"].astype(np.int64)) if "part_id" in names else None
     return gaussians, ids
@@ -113,5 +147,7 @@ def _read_vertices(path: Path) -> np.ndarray:
     dtype = np.dtype(fields)
     body = data[end + len(b"end_header\n") :]
     if len(body) < count * dtype.itemsize:
-        raise UserError(f"{path} ends early: {count} Gaussians need {count * dtype.itemsize} bytes, {len(body)} are there")
+        raise UserError(
+            f"{path} ends early: {count} Gaussians need {count * dtype.itemsize} bytes, {len(body)} are there"
+        )
     return np.frombuffer(body, dtype, count)

@@ -11,9 +11,12 @@ from p2gs.types import GaussianTensors
 
 
 class SplitGaussians(GaussianTensors):
-    """Gaussians whose harmonics lie in two tensors, sh0 [N, 1, 3] and sh_rest [N, B-1, 3]; ``sh`` is joined when it is asked for."""
+    """Gaussians whose harmonics lie in two tensors, sh0 [N, 1, 3] and sh_rest [N, B-1, 3]; ``sh`` is joined when it is
+    asked for."""
 
-    def __init__(self, means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, sh0: Tensor, sh_rest: Tensor):
+    def __init__(
+        self, means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, sh0: Tensor, sh_rest: Tensor
+    ):
         self.means, self.quats, self.log_scales, self.opacity_logits = means, quats, log_scales, opacity_logits
         self.sh0, self.sh_rest = sh0, sh_rest
 
@@ -27,12 +30,13 @@ class SplitGaussians(GaussianTensors):
 
 
 class Splats(nn.Module):
-    """N Gaussians as parameters, with any number of further per-Gaussian parameters (``extra``) and buffers (``carried``).
+    """N Gaussians as parameters, with any number of further per-Gaussian parameters (``extra``) and buffers
+    (``carried``).
 
-    Parameters: means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh0 [N, 1, 3], sh_rest [N, B-1, 3], then
-    ``extra``. Buffers: grad_sum [N] and seen [N] (densification statistics), then ``carried``. Every one has first dimension N,
-    so that ``gather`` (the only function that changes N) treats them alike. A checkpoint with another N loads: the tensors are
-    resized first.
+    Parameters: means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh0 [N, 1, 3], sh_rest [N, B-1, 3],
+    then ``extra``. Buffers: grad_sum [N] and seen [N] (densification statistics), then ``carried``. Every one has first
+    dimension N, so that ``gather`` (the only function that changes N) treats them alike. A checkpoint with another N
+    loads: the tensors are resized first.
     """
 
     means: Tensor
@@ -52,7 +56,12 @@ class Splats(nn.Module):
     mu1: Tensor
     offsets: Tensor
 
-    def __init__(self, gaussians: GaussianTensors, extra: dict[str, Tensor] | None = None, carried: dict[str, Tensor] | None = None):
+    def __init__(
+        self,
+        gaussians: GaussianTensors,
+        extra: dict[str, Tensor] | None = None,
+        carried: dict[str, Tensor] | None = None,
+    ):
         super().__init__()
         n = len(gaussians)
         values = {
@@ -95,17 +104,19 @@ class Splats(nn.Module):
         return SplitGaussians(self.means, self.quats, self.log_scales, self.opacity_logits, self.sh0, self.sh_rest)
 
     def note_gradients(self, abs_grad: Tensor, radii: Tensor, scale: float) -> None:
-        """Add one view's screen-space gradients (|d loss / d mean2d|, [N], pixels) to the statistics, times ``scale``."""
+        """Add one view's screen-space gradients (|d loss / d mean2d|, [N], pixels) to the statistics, times
+        ``scale``."""
         seen = radii > 0
         self.grad_sum += torch.where(seen, abs_grad * scale, torch.zeros_like(abs_grad))
         self.seen += seen
 
 
 def gather(splats: Splats, optimizer: torch.optim.Optimizer, index: Tensor, fresh: Tensor) -> None:
-    """Replace the N Gaussians by rows ``index`` [M] of themselves: drops, copies and reorders. The one place of optimiser surgery.
+    """Replace the N Gaussians by rows ``index`` [M] of themselves: drops, copies and reorders. The one place of
+    optimiser surgery.
 
-    fresh [M] bool: rows that start with empty optimiser moments (new Gaussians). Densification statistics restart at zero.
-    The optimiser's ``step`` counters stay.
+    fresh [M] bool: rows that start with empty optimiser moments (new Gaussians). Densification statistics restart at
+    zero. The optimiser's ``step`` counters stay.
     """
     if index.shape != fresh.shape:
         raise ValueError(f"index {tuple(index.shape)} and fresh {tuple(fresh.shape)} differ in shape")

@@ -1,4 +1,5 @@
-"""RUN/twin.json: the joints of the twin, in the input's coordinates and units. The layout is a contract; other programs read it."""
+"""RUN/twin.json: the joints of the twin, in the input's coordinates and units. The layout is a contract; other programs
+read it."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ def write_twin_json(obj: ArticulatedObject, path: Path | str) -> None:
 
 
 def read_twin_json(path: Path | str) -> tuple[list[Part], float]:
-    """The parts (joints in float64) and the canonical time. Raises UserError when the file is missing or of another kind."""
+    """The parts (joints in float64) and the canonical time. Raises UserError when the file is missing or of another
+    kind."""
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path} is not there: '{path.parent}' is no finished run (p2gs fit writes it at the end)")
@@ -73,7 +75,9 @@ def load_twin(run_dir: Path | str) -> ArticulatedObject:
     if part_ids is None:
         raise UserError(f"{run_dir / CANONICAL} has no part_id column, so its Gaussians belong to no part")
     if len(gaussians) == 0 or int(part_ids.min()) < 0 or int(part_ids.max()) >= len(parts):
-        raise UserError(f"{run_dir / CANONICAL} does not fit twin.json: its part_id leave 0..{len(parts) - 1}, or it holds no Gaussian")
+        raise UserError(
+            f"{run_dir / CANONICAL} does not fit twin.json: its part_id leave 0..{len(parts) - 1}, or it holds no Gaussian"
+        )
     return ArticulatedObject(gaussians, part_ids, parts, canonical_time)
 
 
@@ -114,7 +118,12 @@ def _read_part(data: dict, number: int) -> Part:
             raise ValueError(f"{key} {short(j[key])}")
         return value
 
-    axis, transform, low, high = tensor("axis", 3), tensor("transform", 4, 4), float(j["limits"][0]), float(j["limits"][1])
+    axis, transform, low, high = (
+        tensor("axis", 3),
+        tensor("transform", 4, 4),
+        float(j["limits"][0]),
+        float(j["limits"][1]),
+    )
     motion = float(j["motion"])
     if j["type"] not in ("revolute", "prismatic") or abs(float(axis.norm()) - 1) > 1e-3:
         raise ValueError(f"type {short(j['type'])}, axis {short(j['axis'])}")

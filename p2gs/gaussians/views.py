@@ -1,6 +1,7 @@
 """Where to look from: the run's cameras kept beside the twin, and the view in which the moving parts show best.
 
-RUN/cameras.json is written by ``write_twin`` in input coordinates, so that pictures, meshes and videos need no dataset later.
+RUN/cameras.json is written by ``write_twin`` in input coordinates, so that pictures, meshes and videos need no dataset
+later.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ def write_cameras(path: Path, cameras: Sequence[NamedCamera]) -> None:
 
 
 def read_cameras(path: Path) -> list[NamedCamera]:
-    """Inverse of ``write_cameras``; an empty list where the file is not there. Raises UserError where it cannot be read."""
+    """Inverse of ``write_cameras``; an empty list where the file is not there. Raises UserError where it cannot be
+    read."""
     if not path.is_file():
         return []
     try:
@@ -131,10 +133,11 @@ def point_labels(means: Tensor, part_ids: Tensor, camera: Camera, cell: int = 64
 
 
 def view_score(obj: ArticulatedObject, start: Tensor, end: Tensor, camera: Camera) -> float:
-    """How well a view tells the motion: for each moving part, what shows of it in both states and how much of the image it changes.
+    """How well a view tells the motion: for each moving part, what shows of it in both states and how much of the image
+    it changes.
 
-    start, end: means [M, 3] of the solid Gaussians in both states. Square roots, so that a view which shows every part a
-    little beats one that shows one part well.
+    start, end: means [M, 3] of the solid Gaussians in both states. Square roots, so that a view which shows every part
+    a little beats one that shows one part well.
     """
     ids = obj.part_ids[solid_points(obj)]
     a, b = point_labels(start, ids, camera), point_labels(end, ids, camera)
@@ -148,7 +151,8 @@ def view_score(obj: ArticulatedObject, start: Tensor, end: Tensor, camera: Camer
 
 
 def best_camera(obj: ArticulatedObject, cameras: Sequence[Camera]) -> int:
-    """Index of the camera in which the moving parts and their motion are most visible. ``obj`` in the cameras' coordinates."""
+    """Index of the camera in which the moving parts and their motion are most visible. ``obj`` in the cameras'
+    coordinates."""
     keep = solid_points(obj)
     start, end = pose(obj, 0.0).means[keep], pose(obj, 1.0).means[keep]
     return int(np.argmax([view_score(obj, start, end, c) for c in cameras]))

@@ -41,7 +41,8 @@ KINDS = ("image", "prior", "parts", "motion", "physics", "own")
 class Target:
     """What a rendered view is held against, already cropped and scaled to the render.
 
-    image: [H, W, 3] float32 composited over ``background``.  alpha: [H, W] float32.  depth: [H, W] float32 (0 = unknown) or None.
+    image: [H, W, 3] float32 composited over ``background``.  alpha: [H, W] float32.  depth: [H, W] float32 (0 =
+    unknown) or None.
     background: [3].  key: identifies (view, resolution, crop) for cached statistics.
     """
 
@@ -57,12 +58,14 @@ class PartState:
     """The articulation phase's quantities of one step. K parts including the static slot 0.
 
     probs [N, K] soft assignment.  means_canonical [N, 3].  transforms [K, 4, 4]: start -> end (slot 0 identity).
-    pairs [M] int64: indices of Gaussians with an observed pair; mu0, mu1 [M, 3]: their observed centres in both states (detached).
-    knn [N, k] int64: neighbours in canonical space, self excluded.  target_rotation [K, 3, 3]: detached Kabsch fit of the pairs.
-    repel_points [R, 3] in state-0 coordinates, or None.  extent: diagonal of the object's box.  spacing: median nearest-neighbour
-    distance of the Gaussians.  hardness in [0, 1]: how far the soft-to-hard schedule has come.
-    twists [K-1, 6]: logarithms of the movable parts' transforms where the phase has them at hand.  shared: what losses of this step
-    have computed and others use too, by a key of their own (a graph in common: one backward pass for all of them); ``replace`` drops it.
+    pairs [M] int64: indices of Gaussians with an observed pair; mu0, mu1 [M, 3]: their observed centres in both states
+    (detached).
+    knn [N, k] int64: neighbours in canonical space, self excluded.  target_rotation [K, 3, 3]: detached Kabsch fit of
+    the pairs. repel_points [R, 3] in state-0 coordinates, or None.  extent: diagonal of the object's box.  spacing:
+    median nearest-neighbour distance of the Gaussians.  hardness in [0, 1]: how far the soft-to-hard schedule has come.
+    twists [K-1, 6]: logarithms of the movable parts' transforms where the phase has them at hand.  shared: what losses
+    of this step have computed and others use too, by a key of their own (a graph in common: one backward pass for all
+    of them); ``replace`` drops it.
     """
 
     probs: Tensor
@@ -93,7 +96,8 @@ class PartState:
 class LossInputs:
     """All a loss may look at in one training step. Fields a phase does not have are None.
 
-    ``render``/``target``: the rendered view and its photograph.  ``gaussians``: the parameters as stored (canonical or single-state).
+    ``render``/``target``: the rendered view and its photograph.  ``gaussians``: the parameters as stored (canonical or
+    single-state).
     ``parts``: articulation quantities.  ``step``/``total_steps``: of the phase, counted from 0.
     """
 
@@ -113,11 +117,13 @@ class Loss:
 
     weight: factor in the total.  start, end: active while start <= step / total_steps < end (fractions of the phase).
     end_weight: when given, the weight moves from ``weight`` to it, geometrically, between start and end.
-    every: looked at in one step of so many, with its weight multiplied by that number: the same on average at a part of the cost.
+    every: looked at in one step of so many, with its weight multiplied by that number: the same on average at a part of
+    the cost.
 
-    Two class attributes tell a phase what to make. needs: of ``NEEDS``, what costs time and is made in steps where a loss asks for it
-    (``pairs`` and ``rotations`` include ``parts``; all else of ``LossInputs`` is always there).  kind: of ``KINDS``. The ``image`` losses,
-    which hold a render against its photograph, also fit the twin's Gaussians in the end; each kind has a chart in TensorBoard.
+    Two class attributes tell a phase what to make. needs: of ``NEEDS``, what costs time and is made in steps where a
+    loss asks for it (``pairs`` and ``rotations`` include ``parts``; all else of ``LossInputs`` is always there).  kind:
+    of ``KINDS``. The ``image`` losses, which hold a render against its photograph, also fit the twin's Gaussians in the
+    end; each kind has a chart in TensorBoard.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"parts"})

@@ -1,4 +1,5 @@
-"""Losses on geometry: ``depth``, ``depth_variance`` and ``planar`` on rendered depth, ``flat`` on the Gaussians themselves."""
+"""Losses on geometry: ``depth``, ``depth_variance`` and ``planar`` on rendered depth, ``flat`` on the Gaussians
+themselves."""
 
 from __future__ import annotations
 
@@ -12,10 +13,11 @@ from p2gs.ops.planar import hidden_bends
 
 @register_loss("depth")
 class Depth(Loss):
-    """mean log(1 + |d - d*|) over the pixels whose depth is known (ArtGS's form). Not in the paper; None without depth maps.
+    """mean log(1 + |d - d*|) over the pixels whose depth is known (ArtGS's form). Not in the paper; None without depth
+    maps.
 
-    d is the mean depth of what the ray hits, in the scene's units; pixels that the render covers by less than ``min_alpha`` are
-    left out: their mean depth means little and its gradient is large.
+    d is the mean depth of what the ray hits, in the scene's units; pixels that the render covers by less than
+    ``min_alpha`` are left out: their mean depth means little and its gradient is large.
     """
 
     needs = frozenset()
@@ -36,9 +38,10 @@ class Depth(Loss):
 class DepthVariance(Loss):
     """2 x mean over the foreground of alpha^2 times the variance of depth along the ray. Not in the paper.
 
-    Gathers what a ray sees at one depth: pictures alone leave textureless surfaces a fog that photometric error cannot see.
-    The foreground is where the photograph's alpha is above one half. The default weight falls from 30 to 10 over its span, in
-    the units of an object of unit size. None where the render carries no squared depth (``RenderOutput.depth_sq``).
+    Gathers what a ray sees at one depth: pictures alone leave textureless surfaces a fog that photometric error cannot
+    see. The foreground is where the photograph's alpha is above one half. The default weight falls from 30 to 10 over
+    its span, in the units of an object of unit size. None where the render carries no squared depth
+    (``RenderOutput.depth_sq``).
     """
 
     needs = frozenset({"depth_sq"})
@@ -57,10 +60,10 @@ class DepthVariance(Loss):
 class Planar(Loss):
     """Where a photograph shows nothing between two pixels, the surface between them is flat. Not in the paper.
 
-    Second differences of inverse depth (zero on a plane, in every perspective) over segments of 2 x ``strides`` pixels along rows and
-    columns, in units of depth, each weighted by exp(-t / contrast), t the photograph's total variation along the segment less
-    ``noise`` a pixel. Segments that leave the foreground do not count. Photometric error cannot see dents in plain walls; their rims
-    it can, and this carries the rim's depth inwards.
+    Second differences of inverse depth (zero on a plane, in every perspective) over segments of 2 x ``strides`` pixels
+    along rows and columns, in units of depth, each weighted by exp(-t / contrast), t the photograph's total variation
+    along the segment less ``noise`` a pixel. Segments that leave the foreground do not count. Photometric error cannot
+    see dents in plain walls; their rims it can, and this carries the rim's depth inwards.
     """
 
     needs = frozenset()
@@ -74,15 +77,19 @@ class Planar(Loss):
         render, target = inputs.render, inputs.target
         if render is None or target is None:
             return None
-        return hidden_bends(target.image, target.alpha, render.depth, render.alpha, self.strides, self.contrast, self.noise)
+        return hidden_bends(
+            target.image, target.alpha, render.depth, render.alpha, self.strides, self.contrast, self.noise
+        )
 
 
 @register_loss("flat")
 class Flat(Loss):
-    """Mean over Gaussians of their shortest standard deviation (Chen et al. 2024, PGSR, arXiv:2406.06521). Not in the paper.
+    """Mean over Gaussians of their shortest standard deviation (Chen et al. 2024, PGSR, arXiv:2406.06521). Not in the
+    paper.
 
-    Seen edge-on a surface is a stack of Gaussians as thick as they are: their faint rims add up, the outline grows by two or three
-    standard deviations, and training puts that right by pulling the surface inward. Flat ones have no rims.
+    Seen edge-on a surface is a stack of Gaussians as thick as they are: their faint rims add up, the outline grows by
+    two or three standard deviations, and training puts that right by pulling the surface inward. Flat ones have no
+    rims.
     """
 
     needs = frozenset()

@@ -48,13 +48,15 @@ def unexplained(inputs: LossInputs, sample: int) -> Tensor:
 
 
 def carried(transforms: Tensor, points: Tensor) -> Tensor:
-    """Every point under every motion, [K, 3, M]: the points last, which torch sums and multiplies several times faster than [K, M, 3]."""
+    """Every point under every motion, [K, 3, M]: the points last, which torch sums and multiplies several times faster
+    than [K, M, 3]."""
     count = len(transforms)
     return torch.baddbmm(transforms[:, :3, 3:], transforms[:, :3, :3], points.T.expand(count, -1, -1))
 
 
 def squared(residual: Tensor, robust: float | None, extent: float, dim: int = -1) -> Tensor:
-    """|r|^2 over dimension ``dim``; with ``robust`` (a fraction of the extent) Geman-McClure's s^2 r^2 / (s^2 + r^2)."""
+    """|r|^2 over dimension ``dim``; with ``robust`` (a fraction of the extent) Geman-McClure's s^2 r^2 / (s^2 +
+    r^2)."""
     sq = residual.square().sum(dim)
     if robust is None:
         return sq
@@ -69,10 +71,12 @@ def reduce_pairs(cost: Tensor, reduce: str, total: int) -> Tensor:
 
 @register_loss("vector")
 class Vector(Loss):
-    """L_vector = sum_k sum_i p_ik |R_k mu0_i + t_k - mu1_i|^2 (paper section 4.4), i over observed pairs, slot 0 (the identity) too.
+    """L_vector = sum_k sum_i p_ik |R_k mu0_i + t_k - mu1_i|^2 (paper section 4.4), i over observed pairs, slot 0 (the
+    identity) too.
 
-    Membership is soft, so it teaches the screws and the labels.  reduce: mean over the pairs, or the paper's sum, whose size
-    grows with the number of Gaussians.  sample: pairs looked at per step (0: all).  robust: see ``squared``; None is the paper.
+    Membership is soft, so it teaches the screws and the labels.  reduce: mean over the pairs, or the paper's sum, whose
+    size grows with the number of Gaussians.  sample: pairs looked at per step (0: all).  robust: see ``squared``; None
+    is the paper.
     """
 
     needs = frozenset({"pairs"})
@@ -95,18 +99,21 @@ class Vector(Loss):
 class Art(Loss):
     """L_art = sum_k sum_i |R_k mu_i + t_k + F_i - mu_hat_i|^2 + lambda_rot Angle(R_k, R_hat_k) (paper section 4.3).
 
-    mu_i and mu_hat_i are the observed centres in states 0 and 1, R_hat the Kabsch rotation of the part's pairs (radians, averaged
-    over the movable parts; summed with reduce "sum"). F is the repel force at the moved centre (eq. repel, repel_clamped),
-    differentiable, for movable parts, and only inside this residual: the optimum mu_hat - F lies away from the repel points.
+    mu_i and mu_hat_i are the observed centres in states 0 and 1, R_hat the Kabsch rotation of the part's pairs
+    (radians, averaged over the movable parts; summed with reduce "sum"). F is the repel force at the moved centre (eq.
+    repel, repel_clamped), differentiable, for movable parts, and only inside this residual: the optimum mu_hat - F lies
+    away from the repel points.
 
-    variant: "local" takes the expectation of the squared residual over the soft membership, and for F the sum over the repel
-    points within ``radius`` of strength tau_max (radius / d)^(exponent - 1) towards each, clipped at ``tau_max`` (radius and tau_max:
-    fractions of the extent) and annealed to nothing at ``anneal`` (fraction of the phase): a force that stays leaves the joint off by
-    tau_max. Distances in radii keep it below the clip for any exponent, so that exponent and count of the points act. "paper" blends
-    positions by membership (appendix, "Part Assignment Details") and sums F over all repel points, clipped, to the end; with
-    k_r = 5e-4 and 2,000 points it is at its clip everywhere.
+    variant: "local" takes the expectation of the squared residual over the soft membership, and for F the sum over the
+    repel points within ``radius`` of strength tau_max (radius / d)^(exponent - 1) towards each, clipped at ``tau_max``
+    (radius and tau_max: fractions of the extent) and annealed to nothing at ``anneal`` (fraction of the phase): a force
+    that stays leaves the joint off by tau_max. Distances in radii keep it below the clip for any exponent, so that
+    exponent and count of the points act. "paper" blends positions by membership (appendix, "Part Assignment Details")
+    and sums F over all repel points, clipped, to the end; with k_r = 5e-4 and 2,000 points it is at its clip
+    everywhere.
     strength: share of tau_max that one point at the radius exerts; 0.005 keeps the median force at 0.1 to 0.5 tau_max.
-    source: "observed", or "canonical" to move the Gaussians' canonical centres to state 1 instead of mu0 (they get gradients).
+    source: "observed", or "canonical" to move the Gaussians' canonical centres to state 1 instead of mu0 (they get
+    gradients).
     sign: "paper", or "away" to turn F around (then the optimum is nearer to the repel points).  k_r = 0 switches F off.
     min_prob: memberships below it feel no force (saves most of the work).  reduce, sample, robust: as in ``vector``.
     """

@@ -14,7 +14,8 @@ TINY = 1e-12
 
 
 def sample_rows(total: int, sample: int, step: int, device=None) -> Tensor | slice:
-    """``sample`` distinct row numbers out of ``total``, a function of the step alone; all rows where sample is 0 or not smaller."""
+    """``sample`` distinct row numbers out of ``total``, a function of the step alone; all rows where sample is 0 or not
+    smaller."""
     if sample <= 0 or sample >= total:
         return slice(None)
     return _permutation(total, step)[:sample].to(device)
@@ -28,10 +29,12 @@ def _permutation(total: int, step: int) -> Tensor:
 
 @register_loss("part")
 class Part(Loss):
-    """Neighbouring Gaussians belong to one part: KL(F_i || mean of F_j over the neighbours), paper section 4.2 (L_part).
+    """Neighbouring Gaussians belong to one part: KL(F_i || mean of F_j over the neighbours), paper section 4.2
+    (L_part).
 
-    F = softmax(f(psi)) is ``PartState.probs``, the neighbours are ``PartState.knn`` (k nearest centres, self excluded). Gradients
-    flow into F_i and into the F_j. variant: "mean_neighbour" is the paper's; "pairwise" is mean over j of KL(F_i || F_j).
+    F = softmax(f(psi)) is ``PartState.probs``, the neighbours are ``PartState.knn`` (k nearest centres, self excluded).
+    Gradients flow into F_i and into the F_j. variant: "mean_neighbour" is the paper's; "pairwise" is mean over j of
+    KL(F_i || F_j).
     sample: M, Gaussians looked at per step (0: all).  reduce: the paper's mean over M, or the sum.
     """
 
@@ -60,7 +63,8 @@ class Part(Loss):
 
 @register_loss("entropy")
 class Entropy(Loss):
-    """Mean entropy of the part assignment in nats: makes labels sharp. Not in the paper, which leaves one-part-for-all a minimum."""
+    """Mean entropy of the part assignment in nats: makes labels sharp. Not in the paper, which leaves one-part-for-all
+    a minimum."""
 
     needs = frozenset({"parts"})
     kind = "parts"

@@ -14,7 +14,8 @@ from p2gs.ops.ssim import l1_ssim
 class Render(Loss):
     """(1 - l) |I - I*|_1 + l (1 - SSIM(I, I*)), averaged over pixels and channels (paper eq. render_loss).
 
-    ssim_lambda: l. The paper does not state it; 0.2 is 3DGS's. Refining screws wants it higher (0.8): shading differs between states.
+    ssim_lambda: l. The paper does not state it; 0.2 is 3DGS's. Refining screws wants it higher (0.8): shading differs
+    between states.
     """
 
     needs = frozenset()
@@ -24,7 +25,9 @@ class Render(Loss):
     def compute(self, inputs: LossInputs) -> Tensor | None:
         if inputs.render is None or inputs.target is None:
             return None
-        return l1_ssim(inputs.render.colour, inputs.target.image, self.ssim_lambda, cache=inputs.cache, key=inputs.target.key)
+        return l1_ssim(
+            inputs.render.colour, inputs.target.image, self.ssim_lambda, cache=inputs.cache, key=inputs.target.key
+        )
 
 
 @register_loss("alpha")

@@ -1,4 +1,5 @@
-"""Physics-informed regularisers (paper section 4.4): ``contact`` and ``velocity``; the third, ``vector``, is in ``motion``."""
+"""Physics-informed regularisers (paper section 4.4): ``contact`` and ``velocity``; the third, ``vector``, is in
+``motion``."""
 
 from __future__ import annotations
 
@@ -18,10 +19,11 @@ from p2gs.ops.knn import knn
 class Velocity(Loss):
     """A part's points move alike: sum_k Var over i in part k of a displacement (paper section 4.4, L_velocity).
 
-    variant: "rigid" takes the displacement that the part's rigid motion leaves unexplained, R_k mu0 + t_k - mu1: zero for every
-    true rigid motion. "paper" takes mu1 - mu0 itself, which is zero for translations only: it charges for turning, teaches the
-    labels alone (the screws do not occur in it) and would rather split a door. Var is the membership-weighted mean of squared
-    distances from the weighted mean, over the observed pairs; a slot of less than one Gaussian's mass counts less.
+    variant: "rigid" takes the displacement that the part's rigid motion leaves unexplained, R_k mu0 + t_k - mu1: zero
+    for every true rigid motion. "paper" takes mu1 - mu0 itself, which is zero for translations only: it charges for
+    turning, teaches the labels alone (the screws do not occur in it) and would rather split a door. Var is the
+    membership-weighted mean of squared distances from the weighted mean, over the observed pairs; a slot of less than
+    one Gaussian's mass counts less.
     reduce: mean over the slots, or the paper's sum.  sample: pairs looked at per step (0: all).
     """
 
@@ -49,13 +51,15 @@ class Velocity(Loss):
 
 @register_loss("contact")
 class Contact(Loss):
-    """Movable Gaussians stay on the outer side of the base: mean over part k of max(0, -cos phi_i) (paper section 4.4, L_contact).
+    """Movable Gaussians stay on the outer side of the base: mean over part k of max(0, -cos phi_i) (paper section 4.4,
+    L_contact).
 
-    phi_i is the angle between d_i, from the nearest static centre to mu_i, and d_k, from the static centroid to mu_i. Gaussians
-    belong to their likeliest part; mu_i is posed at one of ``times`` (state times 0..1), in turn from step to step.
-    variant: "margin" (default) weights each term by (1 - |d_i| / margin)_+, margin in units of the Gaussians' spacing: only what
-    touches is pushed. "paper" weights all alike, which punishes containment: a drawer in its cabinet has obtuse angles nearly
-    everywhere, so the loss asks it to leave.
+    phi_i is the angle between d_i, from the nearest static centre to mu_i, and d_k, from the static centroid to mu_i.
+    Gaussians belong to their likeliest part; mu_i is posed at one of ``times`` (state times 0..1), in turn from step to
+    step.
+    variant: "margin" (default) weights each term by (1 - |d_i| / margin)_+, margin in units of the Gaussians' spacing:
+    only what touches is pushed. "paper" weights all alike, which punishes containment: a drawer in its cabinet has
+    obtuse angles nearly everywhere, so the loss asks it to leave.
     reduce: mean over the movable parts present, or the sum.  sample: movable Gaussians looked at per step (0: all).
     """
 

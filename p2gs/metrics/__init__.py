@@ -1,1 +1,2 @@
-"""Scores against ground truth: ``joints``, ``chamfer``, ``image``, ``penetration`` (functions), ``modules`` (torchmetrics classes)."""
+"""Scores against ground truth: ``joints``, ``chamfer``, ``image``, ``penetration`` (functions), ``modules``
+(torchmetrics classes)."""

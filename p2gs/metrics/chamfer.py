@@ -1,8 +1,8 @@
 """Chamfer distance of part meshes, by the protocol of ArtGS (which the paper's tables follow), on the CPU.
 
-Squared distances, mean over points, both directions summed, times 1000; 10,000 area-weighted points a mesh, three sampling
-seeds, start and end averaged; small components of the prediction dropped. Every number comes with its floor, what the true
-surface scores against another sampling of itself: differences below it mean nothing.
+Squared distances, mean over points, both directions summed, times 1000; 10,000 area-weighted points a mesh, three
+sampling seeds, start and end averaged; small components of the prediction dropped. Every number comes with its floor,
+what the true surface scores against another sampling of itself: differences below it mean nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ SEEDS = (0, 1, 2)
 
 @dataclass(frozen=True)
 class PartMeshes:
-    """One object in one state. static: the base.  movable: the moving parts.  whole: all of it; None joins the parts."""
+    """One object in one state. static: the base.  movable: the moving parts.  whole: all of it; None joins the
+    parts."""
 
     static: Triangles | None
     movable: Sequence[Triangles]
@@ -54,7 +55,10 @@ class ChamferReport:
     def to_dict(self) -> dict:
         """Plain numbers, for JSON: {static|movable|whole: {value, floor}, parts, failures}."""
         named = {"static": self.static, "movable": self.movable, "whole": self.whole}
-        return {k: {"value": v, "floor": self.floors[k]} for k, v in named.items()} | {"parts": self.parts, "failures": self.failures}
+        return {k: {"value": v, "floor": self.floors[k]} for k, v in named.items()} | {
+            "parts": self.parts,
+            "failures": self.failures,
+        }
 
 
 def read_mesh(path: Path | str | None) -> Triangles | None:
@@ -65,8 +69,11 @@ def read_mesh(path: Path | str | None) -> Triangles | None:
     return loaded(path, force="mesh", process=False) if path is not None and Path(path).is_file() else None
 
 
-def read_part_meshes(whole: Path | str | None, static: Path | str | None, movable: Sequence[Path | str | None]) -> PartMeshes:
-    """The meshes of one state from their files; a movable part without a file becomes an empty mesh (it keeps its number)."""
+def read_part_meshes(
+    whole: Path | str | None, static: Path | str | None, movable: Sequence[Path | str | None]
+) -> PartMeshes:
+    """The meshes of one state from their files; a movable part without a file becomes an empty mesh (it keeps its
+    number)."""
     empty = Mesh.empty()
     return PartMeshes(read_mesh(static), [read_mesh(m) or empty for m in movable], read_mesh(whole))
 
@@ -96,7 +103,8 @@ def join(meshes: Sequence[Triangles]) -> Mesh | None:
 
 
 def sample_surface(mesh: Triangles, count: int, seed: int | Sequence[int] = 0) -> np.ndarray:
-    """Points uniform by area, [count, 3] float64; the same for the same seed. Raises ValueError for a mesh without area."""
+    """Points uniform by area, [count, 3] float64; the same for the same seed. Raises ValueError for a mesh without
+    area."""
     t = triangles(mesh)
     edges = np.cumsum(_areas(t))
     if len(edges) == 0 or not edges[-1] > 0:
@@ -137,10 +145,11 @@ def mesh_chamfer(pred: Triangles, gt: Triangles, count: int = POINTS, seeds: Seq
 
 
 def match_parts(pred: Mapping[str, PartMeshes], gt: Mapping[str, PartMeshes], count: int = 1000) -> dict[int, int]:
-    """gt part -> predicted part by least Chamfer distance summed over the states (Hungarian), for ``evaluate_joints`` as well.
+    """gt part -> predicted part by least Chamfer distance summed over the states (Hungarian), for ``evaluate_joints``
+    as well.
 
-    What is left over on either side, and parts without a surface, stay unmatched. Preferable to matching by joints when more
-    parts were predicted than there are.
+    What is left over on either side, and parts without a surface, stay unmatched. Preferable to matching by joints when
+    more parts were predicted than there are.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -169,10 +178,10 @@ def evaluate_chamfer(
 ) -> ChamferReport:
     """All Chamfer numbers of one object.
 
-    pred, gt: state name ("start", "end") -> meshes, the states of ``gt`` are evaluated.  assignment: gt movable part -> predicted one
-    (``JointReport.assignment`` or ``match_parts``).  clean: components of a *predicted* mesh below this fraction of its largest are
-    dropped (ground truth is taken as it is, interior faces included); a whole that is its parts joined is what is left of these: a door
-    may well have fewer triangles than a tenth of the base.
+    pred, gt: state name ("start", "end") -> meshes, the states of ``gt`` are evaluated.  assignment: gt movable part ->
+    predicted one (``JointReport.assignment`` or ``match_parts``).  clean: components of a *predicted* mesh below this
+    fraction of its largest are dropped (ground truth is taken as it is, interior faces included); a whole that is its
+    parts joined is what is left of these: a door may well have fewer triangles than a tenth of the base.
 
     >>> box = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
     >>> shift = Mesh(box.vertices + [0, 0, 0.1], box.faces)

@@ -34,7 +34,8 @@ def psnr(pred: Tensor, target: Tensor) -> float:
 
 
 def ssim(pred: Tensor, target: Tensor) -> float:
-    """Structural similarity, 11 x 11 Gaussian window of sigma 1.5 (doi:10.1109/TIP.2003.819861), images [H, W, 3] in [0, 1] (clamped).
+    """Structural similarity, 11 x 11 Gaussian window of sigma 1.5 (doi:10.1109/TIP.2003.819861), images [H, W, 3] in
+    [0, 1] (clamped).
 
     Beyond the border is black, as in the 3DGS family's own evaluation.
 
@@ -45,7 +46,8 @@ def ssim(pred: Tensor, target: Tensor) -> float:
 
 
 def evaluate_images(pred: Sequence[Tensor], target: Sequence[Tensor]) -> ImageReport:
-    """Scores of rendered views against photographs over the same background. Raises ValueError when there are none or they do not pair.
+    """Scores of rendered views against photographs over the same background. Raises ValueError when there are none or
+    they do not pair.
 
     >>> report = evaluate_images([torch.zeros(16, 16, 3)], [torch.full((16, 16, 3), 0.1)])
     >>> round(report.psnr, 3)

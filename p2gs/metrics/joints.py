@@ -1,7 +1,8 @@
 """Joint errors against ground truth: axis angle, axis position, motion; parts matched by assignment.
 
-The protocol of ArtGS (which the paper's tables follow) with its faults removed: arccos is clipped, every ground-truth joint is
-reported on its own, and the mean axis position is given with and without the zeros that prismatic joints contribute.
+The protocol of ArtGS (which the paper's tables follow) with its faults removed: arccos is clipped, every ground-truth
+joint is reported on its own, and the mean axis position is given with and without the zeros that prismatic joints
+contribute.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ PARALLEL = 1e-6
 class JointLike(Protocol):
     """What is read of a joint: ``p2gs.types.Joint`` has it, ground-truth readers give it.
 
-    axis, origin: 3 numbers (tensor, array, list).  motion: signed start -> end about ``axis``, degrees (revolute) or length.
+    axis, origin: 3 numbers (tensor, array, list).  motion: signed start -> end about ``axis``, degrees (revolute) or
+    length.
     """
 
     type: str
@@ -30,7 +32,8 @@ class JointLike(Protocol):
 
 @dataclass(frozen=True)
 class JointErrors:
-    """One pair: axis_angle [degrees, 0..90], axis_position [x10 scene units; None for prismatic], motion [degrees or scene units]."""
+    """One pair: axis_angle [degrees, 0..90], axis_position [x10 scene units; None for prismatic], motion [degrees or
+    scene units]."""
 
     axis_angle: float
     axis_position: float | None
@@ -38,13 +41,15 @@ class JointErrors:
 
     @property
     def cost(self) -> float:
-        """The matching cost of the protocol: degrees + 10 x distance of the axes + motion, that is the sum of what is reported."""
+        """The matching cost of the protocol: degrees + 10 x distance of the axes + motion, that is the sum of what is
+        reported."""
         return self.axis_angle + (self.axis_position or 0.0) + self.motion
 
 
 @dataclass(frozen=True)
 class JointScore:
-    """One ground-truth joint. ``pred`` indexes the predictions, None where nothing was left to match. Failed ('F'): errors is None."""
+    """One ground-truth joint. ``pred`` indexes the predictions, None where nothing was left to match. Failed ('F'):
+    errors is None."""
 
     gt: int
     type: str
@@ -131,9 +136,11 @@ def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def motion_error(pred: JointLike, gt: JointLike) -> float:
-    """How far the start -> end motions are apart: geodesic degrees between the rotations, or length between the translations.
+    """How far the start -> end motions are apart: geodesic degrees between the rotations, or length between the
+    translations.
 
-    Both are taken from axis and signed motion, so flipping both signs changes nothing. The types must agree (ValueError).
+    Both are taken from axis and signed motion, so flipping both signs changes nothing. The types must agree
+    (ValueError).
     """
     if pred.type != gt.type:
         raise ValueError(f"motion error between a {pred.type} and a {gt.type} joint is undefined")
@@ -155,7 +162,8 @@ def joint_errors(pred: JointLike, gt: JointLike) -> JointErrors:
 
 
 def match_joints(pred: Sequence[JointLike], gt: Sequence[JointLike]) -> dict[int, int]:
-    """gt index -> pred index, minimising the summed cost (wrong type: 1e6). Surplus joints of either side stay unmatched."""
+    """gt index -> pred index, minimising the summed cost (wrong type: 1e6). Surplus joints of either side stay
+    unmatched."""
     from scipy.optimize import linear_sum_assignment
 
     cost = np.full((len(gt), len(pred)), TYPE_MISMATCH)
@@ -170,12 +178,14 @@ def _mean(values: list[float]) -> float | None:
     return float(np.mean(values)) if values else None
 
 
-def evaluate_joints(pred: Sequence[JointLike], gt: Sequence[JointLike], assignment: Mapping[int, int] | None = None) -> JointReport:
+def evaluate_joints(
+    pred: Sequence[JointLike], gt: Sequence[JointLike], assignment: Mapping[int, int] | None = None
+) -> JointReport:
     """Errors of every ground-truth joint of one object.
 
-    pred: the twin's joints, any number and order.  gt: the true ones, in the same coordinates and units.  assignment: gt index ->
-    pred index when the parts were matched by other evidence (their meshes), otherwise by ``match_joints``. A ground-truth joint
-    without a partner, or with one of the wrong type, has failed and is counted.
+    pred: the twin's joints, any number and order.  gt: the true ones, in the same coordinates and units.  assignment:
+    gt index -> pred index when the parts were matched by other evidence (their meshes), otherwise by ``match_joints``.
+    A ground-truth joint without a partner, or with one of the wrong type, has failed and is counted.
 
     >>> from types import SimpleNamespace as J
     >>> door = J(type="revolute", axis=[0, 0, 1], origin=[1, 0, 0], motion=60.0)

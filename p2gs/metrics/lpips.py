@@ -1,8 +1,9 @@
-"""LPIPS of rendered views (Zhang et al. 2018, arXiv:1801.03924), AlexNet backbone, through torchmetrics; needs the extra ``lpips``.
+"""LPIPS of rendered views (Zhang et al. 2018, arXiv:1801.03924), AlexNet backbone, through torchmetrics; needs the
+extra ``lpips``.
 
-torchmetrics brings the linear layers; the backbone's ImageNet weights are a file of 240 MB that torchvision would download. Nothing is
-downloaded here: they come from a path that the user gives, or from torch's cache (``torch.hub.get_dir()/checkpoints``), where any
-earlier use of torchvision's AlexNet has left them.
+torchmetrics brings the linear layers; the backbone's ImageNet weights are a file of 240 MB that torchvision would
+download. Nothing is downloaded here: they come from a path that the user gives, or from torch's cache
+(``torch.hub.get_dir()/checkpoints``), where any earlier use of torchvision's AlexNet has left them.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ SMALLEST = 32  # pixels a side: below this AlexNet's third pooling has nothing l
 
 
 def weights_file(path: Optional[Path | str] = None) -> Optional[Path]:
-    """The backbone's weights: ``path``, or the file that P2GS_LPIPS_WEIGHTS names, or torch's cache; None where the cache has none.
+    """The backbone's weights: ``path``, or the file that P2GS_LPIPS_WEIGHTS names, or torch's cache; None where the
+    cache has none.
 
     Raises UserError where a path was given and no file is there.
     """
@@ -60,18 +62,23 @@ def network(file: Path) -> nn.Module:
     net = _NoTrainLpips(net="alex", pnet_rand=True)
     try:
         stored = torch.load(file, map_location="cpu", weights_only=True)
-        layers = {name.removeprefix("features."): value for name, value in stored.items() if name.startswith("features.")}
+        layers = {
+            name.removeprefix("features."): value for name, value in stored.items() if name.startswith("features.")
+        }
         named = {name: layers[name.split(".", 1)[1]] for name in net.net.state_dict()}
         net.net.load_state_dict(named)
     except Exception as err:
         reason = " ".join(str(err).split())
-        raise UserError(f"{file}: holds no weights of torchvision's AlexNet ({type(err).__name__}: {reason[:120]})") from err
+        raise UserError(
+            f"{file}: holds no weights of torchvision's AlexNet ({type(err).__name__}: {reason[:120]})"
+        ) from err
     return net
 
 
 @torch.no_grad()
 def lpips(pred: Tensor, target: Tensor, path: Optional[Path | str] = None) -> Optional[float]:
-    """LPIPS of images [H, W, 3] in [0, 1] (clamped); None where ``why_absent`` says so, or for an image below 32 pixels a side.
+    """LPIPS of images [H, W, 3] in [0, 1] (clamped); None where ``why_absent`` says so, or for an image below 32 pixels
+    a side.
 
     path: as in ``weights_file``. Raises UserError for a file that is missing or holds something else.
     """

@@ -1,7 +1,8 @@
-"""The metrics as ``torchmetrics.Metric``: collect over objects or batches, reset, log. Thin; the work is in the functions.
+"""The metrics as ``torchmetrics.Metric``: collect over objects or batches, reset, log. Thin; the work is in the
+functions.
 
-``p2gs test``, the callback ``evaluation`` and the benches compute through these. States are sums and counts, so results of several
-processes add up; ``report`` is what the last update found, joint by joint or view by view.
+``p2gs test``, the callback ``evaluation`` and the benches compute through these. States are sums and counts, so results
+of several processes add up; ``report`` is what the last update found, joint by joint or view by view.
 """
 
 from __future__ import annotations
@@ -59,7 +60,8 @@ class _Means(Metric):
 
 
 class JointError(_Means):
-    """Means of ``evaluate_joints`` over objects: axis_angle [degrees], pos_artgs and pos_revolute [x10], motion, failures (count).
+    """Means of ``evaluate_joints`` over objects: axis_angle [degrees], pos_artgs and pos_revolute [x10], motion,
+    failures (count).
 
     >>> from types import SimpleNamespace as J
     >>> door = J(type="revolute", axis=[0, 0, 1], origin=[0, 0, 0], motion=60.0)
@@ -75,7 +77,11 @@ class JointError(_Means):
     def update(self, pred, gt, assignment=None) -> None:
         """pred, gt: lists of joints of one object, see ``evaluate_joints``."""
         self.report = report = evaluate_joints(pred, gt, assignment)
-        values = {"axis_angle": report.axis_angle_mean, "pos_artgs": report.pos_mean_artgs, "pos_revolute": report.pos_mean_revolute}
+        values = {
+            "axis_angle": report.axis_angle_mean,
+            "pos_artgs": report.pos_mean_artgs,
+            "pos_revolute": report.pos_mean_revolute,
+        }
         self._note(values | {"motion": report.motion_mean, "failures": report.failures, "joints": len(gt)})
 
 
@@ -98,7 +104,9 @@ class PartChamfer(_Means):
     def update(self, pred, gt, assignment) -> None:
         """State name -> PartMeshes of one object, and gt part -> predicted part, see ``evaluate_chamfer``."""
         self.report = report = evaluate_chamfer(pred, gt, assignment)
-        self._note({"static": report.static, "movable": report.movable, "whole": report.whole, "failures": report.failures})
+        self._note(
+            {"static": report.static, "movable": report.movable, "whole": report.whole, "failures": report.failures}
+        )
 
 
 class ImageQuality(_Means):

@@ -1,9 +1,10 @@
 """How much of the moving parts is inside the base. The paper reports a "Penetration" without defining it; this is ours.
 
 The base occupies a point x where its Gaussians together are more opaque than not: 1 - prod_i (1 - a_i(x)) > 1/2, with
-a_i(x) = opacity_i exp(-mahalanobis^2 / 2), cut off at three standard deviations. Penetration is the fraction of the moving parts'
-solid Gaussians (opacity > 1/2) whose centres are in occupied space, averaged over poses. It is zero for parts that only touch; a
-hinge's seam, where part and base are one surface, contributes a small constant, so compare runs of one object.
+a_i(x) = opacity_i exp(-mahalanobis^2 / 2), cut off at three standard deviations. Penetration is the fraction of the
+moving parts' solid Gaussians (opacity > 1/2) whose centres are in occupied space, averaged over poses. It is zero for
+parts that only touch; a hinge's seam, where part and base are one surface, contributes a small constant, so compare
+runs of one object.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ def penetration(static: GaussianTensors, movable_means: Tensor) -> float:
 
 
 @torch.no_grad()
-def evaluate_penetration(twin: ArticulatedObject, times: Sequence[float] = (0.0, 0.25, 0.5, 0.75, 1.0)) -> dict[str, float]:
+def evaluate_penetration(
+    twin: ArticulatedObject, times: Sequence[float] = (0.0, 0.25, 0.5, 0.75, 1.0)
+) -> dict[str, float]:
     """{"mean": over the poses, "max": of the worst pose}; all moving parts are at the same time."""
     solid = twin.gaussians.opacity_logits > 0
     static = twin.gaussians[twin.part_ids == 0]

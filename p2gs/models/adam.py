@@ -11,12 +11,13 @@ from p2gs.native import native, num_threads
 
 
 class NamedAdam(torch.optim.Adam):
-    """``torch.optim.Adam`` (Kingma and Ba 2015, arXiv:1412.6980) whose groups have names, without weight decay and AMSGrad.
+    """``torch.optim.Adam`` (Kingma and Ba 2015, arXiv:1412.6980) whose groups have names, without weight decay and
+    AMSGrad.
 
-    params: dicts {"params": [...], "name": str, "lr": float, ...}; names are unique.  The state is torch's (``step``, ``exp_avg``,
-    ``exp_avg_sq``), so that checkpoints and the surgery of densification see nothing unusual. float32 parameters on the CPU take the
-    native kernel, anything else torch's step. eps defaults to 3DGS's 1e-15: gradients of Gaussians are small.
-    Raises ValueError when a group has no name or a name comes twice.
+    params: dicts {"params": [...], "name": str, "lr": float, ...}; names are unique.  The state is torch's (``step``,
+    ``exp_avg``, ``exp_avg_sq``), so that checkpoints and the surgery of densification see nothing unusual. float32
+    parameters on the CPU take the native kernel, anything else torch's step. eps defaults to 3DGS's 1e-15: gradients of
+    Gaussians are small. Raises ValueError when a group has no name or a name comes twice.
     """
 
     def __init__(
@@ -56,7 +57,8 @@ class NamedAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        items, alive, touched = [], [], []  # the kernel counts the steps too: ten tensors of one number take torch longer than it
+        # the kernel counts the steps too: ten tensors of one number take torch longer than it
+        items, alive, touched = ([], [], [])
         for group in self.param_groups:
             (beta1, beta2), eps, lr = group["betas"], group["eps"], float(group["lr"])
             for param in group["params"]:

@@ -10,17 +10,19 @@ from torch import Tensor
 
 from p2gs.context import RunContext
 from p2gs.data.base import Visit
+from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
+from p2gs.gaussians.pose import carry
 from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs, PartState
-from p2gs.models.canonical import carry
 from p2gs.models.observed_pairs import ObservedPairs
 from p2gs.models.part_head import PartHead, random_embeddings
-from p2gs.models.phase import exponential, register_phase
+from p2gs.models.phase import register_phase
 from p2gs.models.repel import place_repel_points
-from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates, render_gaussians
+from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates
 from p2gs.motion.screws import PartScrews, blend_move, initial_screws
 from p2gs.ops import se3
+from p2gs.ops.decay import exponential
 from p2gs.ops.knn import knn
 from p2gs.parts.slots import add_spare
 from p2gs.types import GaussianTensors, UserError
@@ -28,11 +30,12 @@ from p2gs.types import GaussianTensors, UserError
 
 @dataclass
 class RepelConfig:
-    """Repel points (paper section 4.3, appendix). count: N_R.  threshold: how near to the static base a movable part must be,
-    by ``threshold_mode`` ("relative" to the box diagonal, "absolute", or in "spacing"s).  noise: length of an offset at their
-    first placement, relative to the diagonal. The callback ``repel`` places them anew, without noise (the dynamic variant).
-    render: their force, as the loss ``art`` has it, moves the Gaussians in what training draws (paper appendix, "Part Assignment
-    Details"), never in what is predicted or handed over."""
+    """Repel points (paper section 4.3, appendix). count: N_R.  threshold: how near to the static base a movable part
+    must be, by ``threshold_mode`` ("relative" to the box diagonal, "absolute", or in "spacing"s).  noise: length of an
+    offset at their first placement, relative to the diagonal. The callback ``repel`` places them anew, without noise
+    (the dynamic variant).
+    render: their force, as the loss ``art`` has it, moves the Gaussians in what training draws (paper appendix, "Part
+    Assignment Details"), never in what is predicted or handed over."""
 
     count: int = 2000
     threshold: float = 0.05
@@ -45,13 +48,15 @@ class RepelConfig:
 class ArticulationConfig(ImageConfig):
     """Options of the articulation phase.
 
-    init: "discovery" starts psi, f and xi from the discovered parts; "identity" and "random" (the paper's own) learn from nothing.
-    psi: "init" begins as ``init`` says; "random" begins psi at random wherever the screws come from: nothing of the discovered labels
-    is used.  embedding_dim: of psi.  temperature .. temperature_end: softmax temperature, falling geometrically until ``harden_until``
-    (fraction of the phase); the paper's letter is 1 throughout.  rate_screws: paper 1e-3.  screws_from: fraction of the phase
-    at which screws begin to learn.  neighbours, refresh: k of the neighbourhood KL, and steps between kNN and pair refreshes.
-    pair_target: "matched" holds the pairs of the fusion; "nearest" renews the observed centres by nearest neighbours in each state
-    from ``nearest_from`` (fraction) on.
+    init: "discovery" starts psi, f and xi from the discovered parts; "identity" and "random" (the paper's own) learn
+    from nothing.
+    psi: "init" begins as ``init`` says; "random" begins psi at random wherever the screws come from: nothing of the
+    discovered labels is used.  embedding_dim: of psi.  temperature .. temperature_end: softmax temperature, falling
+    geometrically until ``harden_until`` (fraction of the phase); the paper's letter is 1 throughout.  rate_screws:
+    paper 1e-3.  screws_from: fraction of the phase at which screws begin to learn.  neighbours, refresh: k of the
+    neighbourhood KL, and steps between kNN and pair refreshes.
+    pair_target: "matched" holds the pairs of the fusion; "nearest" renews the observed centres by nearest neighbours in
+    each state from ``nearest_from`` (fraction) on.
     """
 
     steps: int = 1000
@@ -87,7 +92,9 @@ def check_losses(config: ArticulationConfig, losses: dict[str, Loss], canonical:
             "switch them off (null), or take nearest neighbours throughout (pair_target: nearest, nearest_from: 0.0)"
         )
     if config.repel.render and "art" not in losses:
-        raise UserError("phases.articulation.repel.render: draws the force of losses.art, which is switched off; expected render: false")
+        raise UserError(
+            "phases.articulation.repel.render: draws the force of losses.art, which is switched off; expected render: false"
+        )
 
 
 @register_phase("articulation")
@@ -113,7 +120,9 @@ class ArticulationPhase(ImagePhase):
             )
         parts = len(motions) + 1 if motions is not None and not run.exact else run.num_parts
         states = sharpened or states
-        return cls(section.config, section.losses, canonical, states, motions, parts, run.extent, run.views, **run.common())
+        return cls(
+            section.config, section.losses, canonical, states, motions, parts, run.extent, run.views, **run.common()
+        )
 
     def __init__(
         self,
@@ -135,16 +144,23 @@ class ArticulationPhase(ImagePhase):
         labels = canonical.labels
         if config.init == "discovery":
             assert motions is not None  # ``build`` has seen to it
-            labels, transforms = add_spare(labels, motions.transforms, num_parts - 1 - len(motions), self.generator(0, 6))
+            labels, transforms = add_spare(
+                labels, motions.transforms, num_parts - 1 - len(motions), self.generator(0, 6)
+            )
             spare = len(transforms) - len(motions)
-            self.types, self.confidence = [*motions.types, *["free"] * spare], torch.cat([motions.confidence, torch.zeros(spare)])
+            self.types, self.confidence = (
+                [*motions.types, *["free"] * spare],
+                torch.cat([motions.confidence, torch.zeros(spare)]),
+            )
         else:
             transforms = initial_screws(config.init, num_parts, generator)
             self.types, self.confidence = ["free"] * len(transforms), torch.zeros(len(transforms))
         parts = 1 + len(transforms)
         self.head = PartHead(config.embedding_dim, parts, generator)
         if config.init == "discovery" and config.psi == "init":
-            sure = config.sureness * (0.25 + 0.75 * (canonical.margin / canonical.margin.median().clamp_min(1e-6)).clamp(0, 1))
+            sure = config.sureness * (
+                0.25 + 0.75 * (canonical.margin / canonical.margin.median().clamp_min(1e-6)).clamp(0, 1)
+            )
             psi = self.head.embed(labels, sure)
         else:
             psi = random_embeddings(len(canonical.gaussians), config.embedding_dim, generator)
@@ -160,6 +176,8 @@ class ArticulationPhase(ImagePhase):
         self.register_buffer("spacing", torch.zeros(()))
         self.place_repel_points(0)
 
+    #
+    #
     # -- parameters -----------------------------------------------------------------------------------------------------------
     def parameter_groups(self):
         rates = self.config.rates.at(0.0)
@@ -171,13 +189,19 @@ class ArticulationPhase(ImagePhase):
 
     def learning_rates(self, step: int) -> dict[str, float]:
         fraction = step / max(self.total_steps, 1)
-        screws = exponential(self.config.rate_screws, self.config.rate_screws_end, fraction) if fraction >= self.config.screws_from else 0.0
+        screws = (
+            exponential(self.config.rate_screws, self.config.rate_screws_end, fraction)
+            if fraction >= self.config.screws_from
+            else 0.0
+        )
         return {**self.config.rates.at(fraction), "screws": screws}
 
     def temperature(self, step: int) -> float:
         fraction = step / max(self.total_steps * self.config.harden_until, 1e-9)
         return exponential(self.config.temperature, self.config.temperature_end, fraction)
 
+    #
+    #
     # -- one step -------------------------------------------------------------------------------------------------------------
     def inputs(self, visit: Visit) -> LossInputs:
         step, state = visit.step, visit.state
@@ -193,7 +217,8 @@ class ArticulationPhase(ImagePhase):
         return LossInputs(step, self.total_steps, g, render, target, camera, parts, self.loss_cache)
 
     def repel_force(self, points: Tensor, step: int) -> Tensor:
-        """The force of the loss ``art`` at points [N, 3] of any state (the repel points lie on the base, which does not move)."""
+        """The force of the loss ``art`` at points [N, 3] of any state (the repel points lie on the base, which does not
+        move)."""
         art: Any = self.losses["art"]
         return art.force(points, self.repel_points, self.extent, art.tau(self.extent, step, self.total_steps))
 
@@ -237,7 +262,8 @@ class ArticulationPhase(ImagePhase):
 
     @torch.no_grad()
     def renew_pairs(self, g: GaussianTensors, probs: Tensor) -> None:
-        """Observed centres anew: nearest solid Gaussian of each single-state reconstruction to where the twin stands now."""
+        """Observed centres anew: nearest solid Gaussian of each single-state reconstruction to where the twin stands
+        now."""
         labels = probs.argmax(1)
         found, near = [], torch.ones(len(g), dtype=torch.bool)
         for state, points in enumerate(self.states):
@@ -259,13 +285,22 @@ class ArticulationPhase(ImagePhase):
         noise = r.noise * self.extent if step == 0 else 0.0
         if r.count > 0 and min(len(static), len(movable)) > 0:
             self.repel_points = place_repel_points(
-                static, movable, r.count, r.threshold, r.threshold_mode, noise, self.generator(step, 4), extent=self.extent
+                static,
+                movable,
+                r.count,
+                r.threshold,
+                r.threshold_mode,
+                noise,
+                self.generator(step, 4),
+                extent=self.extent,
             )
 
     def on_load_checkpoint(self, checkpoint) -> None:
         for name in ("repel_points", "knn_index"):
             setattr(self, name, torch.empty_like(checkpoint["state_dict"][name]))
 
+    #
+    #
     # -- results --------------------------------------------------------------------------------------------------------------
     @torch.no_grad()
     def hand_over(self) -> Articulation:
@@ -287,7 +322,9 @@ class ArticulationPhase(ImagePhase):
         strips = {"rgb": [], "parts": []}
         for t in times:
             posed = carry(g, labels, self.screws.at(t - self.times))
-            out = render_gaussians(posed, shot.camera, torch.ones(3, device=device), features=colours, backend=self.rasterizer)
+            out = render_gaussians(
+                posed, shot.camera, torch.ones(3, device=device), features=colours, backend=self.rasterizer
+            )
             assert out.features is not None
             painted = out.features + (1 - out.alpha[..., None])
             strips["rgb"].append(out.colour)

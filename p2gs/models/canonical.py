@@ -9,35 +9,34 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import CanonicalGaussians, PartMotions
-from p2gs.motion.matching import beta_weight, farthest_points, hungarian_pairs, motion_clusters, motion_richness
+from p2gs.gaussians.pose import carry, with_static
+from p2gs.motion.matching import beta_weight, hungarian_pairs, motion_clusters, motion_richness
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.types import GaussianTensors, UserError
-
-__all__ = [
-    "CanonicalConfig", "beta_weight", "blend", "carry", "farthest_points", "fuse", "hungarian_pairs", "motion_richness", "with_static",
-]  # fmt: skip
 
 
 @dataclass
 class CanonicalConfig:
     """How two single-state reconstructions become one.
 
-    beta: "global" (paper Eq. for beta from motion richness), "uniform" (0.5) or "per_part" (each part its own D; ablation; where no parts
-    are known, ``motion_clusters`` of the pairs stand for them).
-    correspondence: "motion" carries both states to canonical time by the discovered motions before matching; "hungarian" is the
-    paper's letter: raw centres are matched and a pair is joined by a chord. match_size: farthest points per state that are matched.
-    match_smaller: "farthest" cuts both states to ``match_size``; "whole" keeps all of the smaller state (the paper names no cut; both
-    uncut, 100,000 Gaussians a state make a matrix of 80 GB).
-    fusion: "union" keeps the Gaussians of the motion-rich state and adds what only the other state saw; "paper" replaces matched
-    Gaussians by beta-weighted averages of all parameters and keeps unmatched ones by ``unmatched``: "static" (those of the
-    motion-rich state that did not move), "none" or "all". "none" is the ablation without canonical initialisation: the start
-    state's Gaussians as they are, at canonical time 0, with no observed pairs.
-    min_opacity: fainter Gaussians take no part in D and matching (0 = all do).  trim: fraction of the largest distances left out of D
-    (floaters).
-    free_space: tolerance (internal units) of the test that drops or relabels what the other state's cameras see through; 0 = off.
-    hidden: what only the poorer state saw is kept where this share of the richer state's views has something in front of it; elsewhere
-    the richer state shows what there is (0 = all is kept; needs free_space).
+    beta: "global" (paper Eq. for beta from motion richness), "uniform" (0.5) or "per_part" (each part its own D;
+    ablation; where no parts are known, ``motion_clusters`` of the pairs stand for them).
+    correspondence: "motion" carries both states to canonical time by the discovered motions before matching;
+    "hungarian" is the paper's letter: raw centres are matched and a pair is joined by a chord. match_size: farthest
+    points per state that are matched.
+    match_smaller: "farthest" cuts both states to ``match_size``; "whole" keeps all of the smaller state (the paper
+    names no cut; both uncut, 100,000 Gaussians a state make a matrix of 80 GB).
+    fusion: "union" keeps the Gaussians of the motion-rich state and adds what only the other state saw; "paper"
+    replaces matched Gaussians by beta-weighted averages of all parameters and keeps unmatched ones by ``unmatched``:
+    "static" (those of the motion-rich state that did not move), "none" or "all". "none" is the ablation without
+    canonical initialisation: the start state's Gaussians as they are, at canonical time 0, with no observed pairs.
+    min_opacity: fainter Gaussians take no part in D and matching (0 = all do).  trim: fraction of the largest distances
+    left out of D (floaters).
+    free_space: tolerance (internal units) of the test that drops or relabels what the other state's cameras see
+    through; 0 = off.
+    hidden: what only the poorer state saw is kept where this share of the richer state's views has something in front
+    of it; elsewhere the richer state shows what there is (0 = all is kept; needs free_space).
     """
 
     beta: Literal["global", "uniform", "per_part"] = "global"
@@ -53,7 +52,8 @@ class CanonicalConfig:
 
 
 def keep_rows(c: CanonicalGaussians, labels: Tensor, keep: Tensor) -> CanonicalGaussians:
-    """The canonical Gaussians of ``keep`` [N] bool with new ``labels`` [N]; a relabelled one is no observed pair any more."""
+    """The canonical Gaussians of ``keep`` [N] bool with new ``labels`` [N]; a relabelled one is no observed pair any
+    more."""
     paired = c.paired & (labels == c.labels)
     offsets = None if c.offsets is None else c.offsets[keep]
     counted = {**c.diagnostics, "relabelled": int((keep & (labels != c.labels)).sum()), "dropped": int((~keep).sum())}
@@ -61,22 +61,9 @@ def keep_rows(c: CanonicalGaussians, labels: Tensor, keep: Tensor) -> CanonicalG
     return CanonicalGaussians(c.gaussians[keep], c.betas, *kept, offsets, counted)
 
 
-def carry(g: GaussianTensors, labels: Tensor, transforms: Tensor) -> GaussianTensors:
-    """Gaussians moved by the rigid motion of their part. transforms [K, 4, 4], slot 0 included."""
-    T = transforms.to(g.means)
-    R = T[:, :3, :3]
-    means = (R[labels] * g.means[:, None, :]).sum(-1) + T[labels, :3, 3]
-    quats = so3.quat_multiply(so3.matrix_to_quat(R)[labels], so3.quat_normalize(g.quats))
-    return g.placed(means, quats)
-
-
-def with_static(transforms: Tensor) -> Tensor:
-    """[K-1, 4, 4] -> [K, 4, 4] with the identity in slot 0."""
-    return torch.cat([torch.eye(4, dtype=transforms.dtype)[None], transforms])
-
-
 def blend(a: GaussianTensors, b: GaussianTensors, weight: float | Tensor) -> GaussianTensors:
-    """weight * a + (1 - weight) * b of all stored parameters (weight a float or [N, 1]); quaternions in one hemisphere, normalised."""
+    """weight * a + (1 - weight) * b of all stored parameters (weight a float or [N, 1]); quaternions in one hemisphere,
+    normalised."""
     qa, qb = so3.quat_normalize(a.quats), so3.quat_normalize(b.quats)
     qb = torch.where((qa * qb).sum(1, keepdim=True) < 0, -qb, qb)
     w = torch.as_tensor(weight, dtype=a.means.dtype).expand(len(a), 1)
@@ -99,10 +86,11 @@ def fuse(
 ) -> CanonicalGaussians:
     """Two single-state reconstructions -> one canonical field.
 
-    hidden: [N] float by state, the share of the other state's views that has something in front of each Gaussian (``hidden_share``).
+    hidden: [N] float by state, the share of the other state's views that has something in front of each Gaussian
+    (``hidden_share``).
     num_parts: K, the static base counted, for ``beta: per_part`` without motions.
-    Without motions (or with ``correspondence: hungarian``) a matched pair becomes beta mu0 + (1-beta) mu1 and remembers its chord.
-    Raises UserError when ``beta: per_part`` is asked for without parts and without their number.
+    Without motions (or with ``correspondence: hungarian``) a matched pair becomes beta mu0 + (1-beta) mu1 and remembers
+    its chord. Raises UserError when ``beta: per_part`` is asked for without parts and without their number.
     """
     solid = [torch.sigmoid(g.opacity_logits) > config.min_opacity for g in (g0, g1)]
     if config.min_opacity <= 0:
@@ -149,7 +137,9 @@ def _fuse_chords(g0, g1, motions, solid, betas, start_is_rich, config, num_parts
         labels, margin = motions.labels, motions.margin
         weight = betas[labels[0][i]][:, None]
     elif config.beta == "per_part":
-        weight = _cluster_betas(g0.means[i], g1.means[j], g0.means[s0], g1.means[s1], num_parts - 1, float(betas[0]), config.trim)[:, None]
+        weight = _cluster_betas(
+            g0.means[i], g1.means[j], g0.means[s0], g1.means[s1], num_parts - 1, float(betas[0]), config.trim
+        )[:, None]
     else:
         weight = float(betas[0])
     pairs = blend(g0[i], g1[j], weight)
@@ -168,8 +158,11 @@ def _fuse_chords(g0, g1, motions, solid, betas, start_is_rich, config, num_parts
     return _with_pairs(g, betas, new_labels, new_margin, torch.arange(len(i)), g0.means[i], g1.means[j], offsets)
 
 
-def _cluster_betas(start: Tensor, end: Tensor, all0: Tensor, all1: Tensor, movable: int, rest: float, trim: float) -> Tensor:
-    """beta [M] of each pair: of its motion cluster by the cluster's own D, ``rest`` where it is still. all0, all1 [N, 3]: the states."""
+def _cluster_betas(
+    start: Tensor, end: Tensor, all0: Tensor, all1: Tensor, movable: int, rest: float, trim: float
+) -> Tensor:
+    """beta [M] of each pair: of its motion cluster by the cluster's own D, ``rest`` where it is still. all0, all1 [N,
+    3]: the states."""
     cluster = motion_clusters(start, end, movable)
     betas = torch.full((len(start),), rest, dtype=torch.float64)
     for k in range(1, movable + 1):

@@ -24,12 +24,12 @@ def densify(
     """Prune Gaussians that are faint, huge or in no view since the last call, then grow towards ``target`` by
     copying those with the largest mean screen gradient.
 
-    Gaussians larger than ``split_scale`` (internal units, largest axis) are split: both copies are shrunk by 1.6 and the
-    second is drawn from the first's density; smaller ones are cloned in place with both opacities lowered so that the pair is
-    as opaque as the one was. At most ``max_growth`` of the present count is added in one call. Gradient-ranked growth to a
-    budget rather than a threshold keeps time and memory predictable.
-    threshold: above 0, every Gaussian grows whose mean screen gradient exceeds it (3DGS's rule; loss per half the image's height, of
-    absolute gradients), and ``target`` (None: nothing) is all that limits their number.
+    Gaussians larger than ``split_scale`` (internal units, largest axis) are split: both copies are shrunk by 1.6 and
+    the second is drawn from the first's density; smaller ones are cloned in place with both opacities lowered so that
+    the pair is as opaque as the one was. At most ``max_growth`` of the present count is added in one call.
+    Gradient-ranked growth to a budget rather than a threshold keeps time and memory predictable.
+    threshold: above 0, every Gaussian grows whose mean screen gradient exceeds it (3DGS's rule; loss per half the
+    image's height, of absolute gradients), and ``target`` (None: nothing) is all that limits their number.
 
     Returns (added, pruned). Raises ValueError without both target and threshold.
     """
@@ -39,7 +39,8 @@ def densify(
         opacity = torch.sigmoid(splats.opacity_logits)
         scale = splats.log_scales.exp().amax(dim=1)
         finite = torch.isfinite(splats.means).all(dim=1) & torch.isfinite(scale)
-        watched = splats.seen > 0 if bool((splats.seen > 0).any()) else torch.ones_like(finite)  # what no view sees is never carved away
+        # what no view sees is never carved away
+        watched = splats.seen > 0 if bool((splats.seen > 0).any()) else torch.ones_like(finite)
         keep = (opacity > min_opacity) & (scale < max_scale) & finite & watched
         if not keep.any():
             keep = finite  # an object that is not there yet: prune nothing but garbage
@@ -52,7 +53,8 @@ def densify(
             score = (splats.grad_sum / splats.seen.clamp_min(1))[kept]
             # stable sort: ties must not depend on the thread count
             order = torch.sort(score, descending=True, stable=True).indices[:room]
-            grown = kept[order[score[order] > 2 * threshold]]  # the statistics are per image height, twice the gradient per half of it
+            # the statistics are per image height, twice the gradient per half of it
+            grown = kept[order[score[order] > 2 * threshold]]
         index = torch.cat([kept, grown])
         fresh = torch.zeros(index.numel(), dtype=torch.bool, device=index.device)
         fresh[kept.numel() :] = True

@@ -1,17 +1,18 @@
-"""From what was learned to the twin: clean labels, drop empty slots, refine the screws with everything frozen, name the joints."""
+"""From what was learned to the twin: clean labels, drop empty slots, refine the screws with everything frozen, name the
+joints."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Callable, Literal, Optional, Sequence
+from typing import Literal, Sequence
 
 import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
+from p2gs.gaussians.pose import carry, with_static
 from p2gs.losses.base import Loss
-from p2gs.models.canonical import carry, with_static
 from p2gs.models.tune import TuneConfig, tune
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
@@ -20,10 +21,9 @@ from p2gs.motion.screw_polish import PolishConfig, photometric_cost
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.parts.islands import settle_twin_islands
-from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, Part, Similarity
+from p2gs.surface.contents import in_trays
+from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
 from p2gs.visibility.depth_stack import DepthStack
-
-Contents = Callable[[ArticulatedObject, Sequence[tuple[int, Camera]], str], tuple[Tensor, Tensor]]  # ``p2gs.surface.contents.in_trays``
 
 UNKNOWN = 4.0  # a state's Gaussian farther than this from the twin, in the median's units, is none of the twin's
 
@@ -32,19 +32,21 @@ UNKNOWN = 4.0  # a state's Gaussian farther than this from the twin, in the medi
 class FinishConfig:
     """Options of the last stage.
 
-    polish: photometric refinement of the screws with hard labels and frozen Gaussians. survey: shifts of a part within its own surface
-    that are tried after it (internal units; [] = none). tune: then the Gaussians once more, with the screws frozen. min_mass: a slot with
-    a smaller share of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
-    prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a slide. clean_neighbours: labels are the
-    majority among this many neighbours at canonical time (0 = as learned). islands: pieces of a part smaller than this share of its
-    largest go to what they touch (0 = off). trays: views of a state by which drawers' trays are found, what is in or on which goes with
-    the drawer (0 = off). exports: simulator formats written at the end of a fit, with meshes and report (empty:
-    neither; `p2gs export` makes them later). extend_range: joint limits go on beyond the observed motion until the part touches another
-    one (half a turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians whose majority exceeds the rest
-    by less are shown as such in the diagnosis (0..1). complete: meshes have guesses for what no camera saw (undersides,
-    drawers' trays, hidden middles). whole: the mesh of the whole is its parts "joined", or a surface of its own, made "separate"ly from
-    each state's views, as PARIS, DTA and ArtGS have it. cluster: for meshes a moving part keeps only its largest DBSCAN cluster of
-    Gaussians, this the radius (input units; 0 = off; ArtGS cleans real scans so, with 0.05).
+    polish: photometric refinement of the screws with hard labels and frozen Gaussians. survey: shifts of a part within
+    its own surface that are tried after it (internal units; [] = none). tune: then the Gaussians once more, with the
+    screws frozen. min_mass: a slot with a smaller share of the solid Gaussians vanishes. min_motion: likewise one that
+    moves its points by less (internal units).
+    prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a slide.
+    clean_neighbours: labels are the majority among this many neighbours at canonical time (0 = as learned). islands:
+    pieces of a part smaller than this share of its largest go to what they touch (0 = off). trays: views of a state by
+    which drawers' trays are found, what is in or on which goes with the drawer (0 = off). exports: simulator formats
+    written at the end of a fit, with meshes and report (empty: neither; `p2gs export` makes them later). extend_range:
+    joint limits go on beyond the observed motion until the part touches another one (half a turn, the object's diagonal
+    at most); off: they are the observed motion. unclear: Gaussians whose majority exceeds the rest by less are shown as
+    such in the diagnosis (0..1). complete: meshes have guesses for what no camera saw (undersides, drawers' trays,
+    hidden middles). whole: the mesh of the whole is its parts "joined", or a surface of its own, made "separate"ly from
+    each state's views, as PARIS, DTA and ArtGS have it. cluster: for meshes a moving part keeps only its largest DBSCAN
+    cluster of Gaussians, this the radius (input units; 0 = off; ArtGS cleans real scans so, with 0.05).
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0))
@@ -68,10 +70,11 @@ class FinishConfig:
 class FinishRecord:
     """What the last stage measured, for the diagnosis.
 
-    labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the polish
-    (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
-    start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.  slots: the
-    learned slot of each part.  contents: Gaussians that became a drawer's because they are on or in its tray.
+    labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the
+    polish (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
+    start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.
+    slots: the learned slot of each part.  contents: Gaussians that became a drawer's because they are on or in its
+    tray.
     """
 
     labels: list[Tensor]
@@ -86,7 +89,8 @@ class FinishRecord:
 
 
 def majority(labels: Tensor, neighbours: Tensor, weights: Tensor, parts: int) -> tuple[Tensor, Tensor]:
-    """Weighted majority of labels [M] over neighbours [N, k] (indices into labels), weights [N, k]: label [N] and its share [N]."""
+    """Weighted majority of labels [M] over neighbours [N, k] (indices into labels), weights [N, k]: label [N] and its
+    share [N]."""
     votes = torch.zeros(len(neighbours), parts)
     votes.scatter_add_(1, labels[neighbours], weights)
     share, label = votes.max(1)
@@ -113,16 +117,23 @@ def surviving_slots(learned: Articulation, labels: Tensor, config: FinishConfig)
         if mass < config.min_mass:
             continue
         points = learned.gaussians.means[rows].double()
-        at = [se3.apply(se3.screw_at(learned.transforms[k - 1], s - learned.canonical_time), points) for s in (0.0, 1.0)]
+        at = [
+            se3.apply(se3.screw_at(learned.transforms[k - 1], s - learned.canonical_time), points) for s in (0.0, 1.0)
+        ]
         if float((at[1] - at[0]).norm(dim=1).mean()) >= config.min_motion:
             alive.append(k)
     return alive
 
 
-def state_labels(learned: Articulation, labels: Tensor, state: StateGaussians, transforms: Tensor, k: int = 6) -> tuple[Tensor, Tensor]:
-    """Labels of a single-state reconstruction by the twin posed in that state; margin = how far the majority exceeds the rest, 0..1, or -1
-    for what the twin has nothing near of (lids that gave way to walls): the polish leaves that out."""
-    posed = carry(learned.gaussians, labels, se3.screw_at(with_static(transforms), state.state - learned.canonical_time))
+def state_labels(
+    learned: Articulation, labels: Tensor, state: StateGaussians, transforms: Tensor, k: int = 6
+) -> tuple[Tensor, Tensor]:
+    """Labels of a single-state reconstruction by the twin posed in that state; margin = how far the majority exceeds
+    the rest, 0..1, or -1 for what the twin has nothing near of (lids that gave way to walls): the polish leaves that
+    out."""
+    posed = carry(
+        learned.gaussians, labels, se3.screw_at(with_static(transforms), state.state - learned.canonical_time)
+    )
     solid = (torch.sigmoid(posed.opacity_logits) > 0.1).nonzero().squeeze(1)
     distance, index = knn(posed.means[solid], state.gaussians.means, k, False)
     spacing = distance[:, 0].median().clamp_min(1e-4)
@@ -135,7 +146,10 @@ def state_labels(learned: Articulation, labels: Tensor, state: StateGaussians, t
 def name_types(types: list[str], transforms: Tensor, below: float) -> list[str]:
     """Give every "free" motion a joint type by its angle."""
     angle = so3.rotation_angle(transforms[:, :3, :3]) * 57.29578 if len(transforms) else []
-    return [("prismatic" if float(a) < below else "revolute") if t == "free" else t for t, a in zip(types, angle, strict=True)]
+    return [
+        ("prismatic" if float(a) < below else "revolute") if t == "free" else t
+        for t, a in zip(types, angle, strict=True)
+    ]
 
 
 def constrain(kind: str, T: Tensor, centre: Tensor) -> Tensor:
@@ -158,14 +172,13 @@ def finish(
     seed: int,
     backend: str,
     twin_backend: str | None = None,
-    contents: Optional[Contents] = None,
     device="cpu",
 ) -> tuple[ArticulatedObject, list[str], FinishRecord]:
     """The twin, one line for each slot that vanished, and what was measured on the way.
 
-    views: photographs by state.  losses: those of the last training phase, for ``tune`` (None: it is left out).  backend: draws the states,
-    twin_backend: the twin in ``tune`` (None: the same).  contents: finds what is in drawers (None: nobody does).  A part's confidence
-    is ``JointEvidence.confidence`` of its joint.
+    views: photographs by state.  losses: those of the last training phase, for ``tune`` (None: it is left out).
+    backend: draws the states, twin_backend: the twin in ``tune`` (None: the same).  A part's confidence is
+    ``JointEvidence.confidence`` of its joint.
     """
     labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
     alive = surviving_slots(learned, labels, config)
@@ -190,14 +203,18 @@ def finish(
     level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
     twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
-    labels, moved = settle_labels(twin, views, stacks, config, contents, twin_backend or backend)
+    labels, moved = settle_labels(twin, views, stacks, config, twin_backend or backend)
     found = [state_labels(learned, labels, s, transforms) for s in states]
-    record = FinishRecord([f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive, contents=moved)
+    record = FinishRecord(
+        [f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive, contents=moved
+    )
     options["seed"] = seed
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         refined = refine(states, motions, views, config.polish, stacks, **options)
-        refined, _ = leave_false_minima(Judge(None, states, views, config.polish, stacks, **options), refined, config.survey)
+        refined, _ = leave_false_minima(
+            Judge(None, states, views, config.polish, stacks, **options), refined, config.survey
+        )
         transforms = refined.transforms
         record.after = transforms
         record.polish = single_ways(states, refined, views, config.polish, stacks, **options)
@@ -215,13 +232,12 @@ def settle_labels(
     views: dict[int, TrainingViews],
     stacks: list[DepthStack],
     config: FinishConfig,
-    contents: Optional[Contents],
     backend: str,
 ) -> tuple[Tensor, int]:
     """Labels [N] without islands, what is in drawers with these; and to how many Gaussians the latter happened.
 
-    twin: as learned, internal coordinates; views: photographs by state; stacks: rendered depth of both states; contents: finds what is in
-    drawers; backend: draws the twin for it.
+    twin: as learned, internal coordinates; views: photographs by state; stacks: rendered depth of both states; backend:
+    draws the twin for what is in drawers.
     """
     fuller = round(twin.canonical_time)  # the state that shows more
     T = torch.stack([torch.eye(4, dtype=torch.float64)] + [p.joint.transform for p in twin.parts[1:]])
@@ -232,10 +248,10 @@ def settle_labels(
         return settle_twin_islands(posed, labels, config.islands, away, stacks[1 - fuller], tau, held)
 
     labels = without_islands(twin.part_ids)
-    if config.trays <= 0 or contents is None:
+    if config.trays <= 0:
         return labels, 0
     cameras = [(s, views[s].camera(i, -1)) for s in (0, 1) for i in views[s].spread(config.trays)]
-    settled, held = contents(replace(twin, part_ids=labels), cameras, backend)
+    settled, held = in_trays(replace(twin, part_ids=labels), cameras, backend)
     count = int((settled != labels).sum())
     return without_islands(settled, held) if count else labels, count
 
@@ -274,7 +290,8 @@ def measure(
     for name, T in (("before", record.before), ("after", record.after)):
         ways = (T, se3.inverse(T))
         record.costs[name] = [
-            photometric_cost(states[s].gaussians, record.labels[s], ways[s], views[1 - s], count=8, **options) for s in (0, 1)
+            photometric_cost(states[s].gaussians, record.labels[s], ways[s], views[1 - s], count=8, **options)
+            for s in (0, 1)
         ]
     both = [record.polish[w] for w in ("forward", "backward")] if "backward" in record.polish else None
     known = [m >= 0 for m in record.margin]
@@ -284,8 +301,8 @@ def measure(
 
 
 def make_joint(kind: str, transform: Tensor, centre: Tensor) -> Joint:
-    """A joint from its start -> end motion [4, 4]; ``centre`` [3] is the part's centre at the start (origin of a slide; picks the origin on
-    a hinge's axis nearest to it). The observed motion is the range."""
+    """A joint from its start -> end motion [4, 4]; ``centre`` [3] is the part's centre at the start (origin of a slide;
+    picks the origin on a hinge's axis nearest to it). The observed motion is the range."""
     screw = se3.screw_parameters(transform.double())
     if kind == "prismatic":
         length = float(transform[:3, 3].norm())

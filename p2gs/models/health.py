@@ -15,7 +15,8 @@ NUMBERS = (*GaussianTensors.NAMES, "transforms", "probs", "betas")  # fields of 
 
 
 class LossNotFinite(UserError):
-    """The loss of a step is NaN or infinite. Raised before the backward pass: parameters are still those of the step before."""
+    """The loss of a step is NaN or infinite. Raised before the backward pass: parameters are still those of the step
+    before."""
 
 
 def check_loss(stage: str, step: int, scalars: dict[str, Tensor | float]) -> None:
@@ -44,7 +45,8 @@ def check_gaussians(stage: str, count: int, before: int | None = None) -> None:
 
 
 def check_result(stage: str, value: Any) -> None:
-    """Raise UserError where a tensor of Gaussians, motions or assignments that a stage hands over holds NaN or infinity."""
+    """Raise UserError where a tensor of Gaussians, motions or assignments that a stage hands over holds NaN or
+    infinity."""
     for name, tensor in _tensors(value):
         wrong = ~torch.isfinite(tensor)
         if bool(wrong.any()):
@@ -63,7 +65,8 @@ def section_of_stage(stage: str) -> str:
 
 
 def _tensors(value: Any) -> Iterator[tuple[str, Tensor]]:
-    """Tensors of a hand-over object whose every entry has to be a number (margins may be infinite: nothing contends)."""
+    """Tensors of a hand-over object whose every entry has to be a number (margins may be infinite: nothing
+    contends)."""
     if not dataclasses.is_dataclass(value):
         return
     for f in dataclasses.fields(value):

@@ -13,12 +13,14 @@ HULL_MARGIN = 0.02  # of the image's long edge: silhouettes grow by it
 HULL_SHARE = 0.9  # share of the views that must see a point inside
 
 
-def initial_points(scene: TwoStateScene, state: int, count: int, init: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def initial_points(
+    scene: TwoStateScene, state: int, count: int, init: str, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
     """Points [N, 3] and colours [N, 3] to start from.
 
-    init "auto": depth points where every training view has depth, else as "random": uniform in the space that the state's (slightly
-    grown) silhouettes enclose. Not on that hull's surface, which would seal concavities; not in the whole box either, since what
-    no cropped view sees is never carved away.
+    init "auto": depth points where every training view has depth, else as "random": uniform in the space that the
+    state's (slightly grown) silhouettes enclose. Not on that hull's surface, which would seal concavities; not in the
+    whole box either, since what no cropped view sees is never carved away.
     """
     views = scene.select(state=state, split="train")
     if init == "auto" and scene.has_depth:
@@ -39,7 +41,8 @@ def initial_points(scene: TwoStateScene, state: int, count: int, init: str, gene
 
 
 def inside_masks(points: Tensor, views: Sequence[View], size: int = 100) -> Tensor:
-    """Which points [N, 3] lie inside the grown masks of at least ``HULL_SHARE`` of the views that have them in the image, [N] bool."""
+    """Which points [N, 3] lie inside the grown masks of at least ``HULL_SHARE`` of the views that have them in the
+    image, [N] bool."""
     seen, inside = torch.zeros(len(points)), torch.zeros(len(points))
     for view in views:
         factor = min(size / max(view.camera.width, view.camera.height), 1.0)

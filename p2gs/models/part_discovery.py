@@ -5,68 +5,25 @@ Not a training phase of the paper: its ancestors need hand-made part centres or 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from p2gs.context import RunContext
 from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.models.phase import PHASES
-from p2gs.motion.discovery import Discovery, DiscoveryConfig, StateEvidence, discover, relabel
+from p2gs.models.stage import Stage, register_phase
+from p2gs.motion.discovery import Discovery, StateEvidence, discover, relabel
 from p2gs.motion.refine_motions import Judge, leave_false_minima
-from p2gs.motion.screw_polish import PolishConfig
 from p2gs.parts.bodies import Surfaces, one_part_a_body
+from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import join_twins, settle_types, simplify
 from p2gs.parts.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
+from p2gs.parts.slots import merge_to
 from p2gs.types import TwoStateScene, UserError
 from p2gs.visibility.evidence import gather_evidence
-
-
-@dataclass
-class PartMotionsConfig:
-    """Options of part discovery.
-
-    evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
-    candidates: how many complete explanations, and later changes of one kind, are compared by re-rendering; of more explanations those that
-    look best at a glance, after ``look_steps`` of refinement at the smallest size.
-    coarse: photometric refinement right after discovery.
-    compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
-    freedom_penalty: relative image loss by which a turn must win against a slide.
-    same_motion: two touching parts whose motions carry them this near to each other (internal units) are tried as one.
-    survey: shifts within its own surface tried for each part (internal units; [] = none).
-    part_penalty: share of the image loss that each part must save, or goes, and that one which is added or halved must save when parts are
-    reconsidered. On ten objects junk saved at most 1.6 %, true parts 6 % and more, the second of two stacked doors 3 %.
-    islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
-    (0 = off).  rounds: how often labels, types and motions are settled anew.
-    reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched again amid the others,
-    refined, and taken where the energy falls.
-    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
-    """
-
-    evidence_size: int = 200
-    min_opacity: float = 0.5
-    candidates: int = 3
-    look_steps: int = 40
-    compare_types_below: float = 45.0
-    freedom_penalty: float = 0.002
-    same_motion: float = 0.04
-    part_penalty: float = 0.02
-    survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
-    islands: float = 0.25
-    rounds: int = 2
-    reconsider: bool = True
-    min_confidence: float = 0.02
-    search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
-    coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
-
-
-@PHASES.register("discovery")
-class DiscoveryStage:
-    """A stage without training: no losses, no callbacks."""
-
-    Config = PartMotionsConfig
-    trained = False
 
 
 def find_part_motions(
@@ -100,10 +57,13 @@ def find_part_motions(
         motions = judge.refine(motions)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
     for part in unfounded:
-        say(f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})")
+        say(
+            f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})"
+        )
     motions.diagnostics = {
         "first_looks": looks,
-        "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],  # of the Gaussians above min_opacity
+        # of the Gaussians above min_opacity
+        "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],
         "min_opacity": config.min_opacity,
         **compared,
         **improved,
@@ -115,7 +75,9 @@ def find_part_motions(
     return motions
 
 
-def _evidence(states: list[StateGaussians], scene: TwoStateScene, config: PartMotionsConfig, backend: str, device) -> list[StateEvidence]:
+def _evidence(
+    states: list[StateGaussians], scene: TwoStateScene, config: PartMotionsConfig, backend: str, device
+) -> list[StateEvidence]:
     """Surface points and rendered depth of both states. Raises UserError where there are none."""
     out = []
     for s in states:
@@ -123,12 +85,15 @@ def _evidence(states: list[StateGaussians], scene: TwoStateScene, config: PartMo
         out.append(gather_evidence(s.gaussians, seen, config.evidence_size, config.min_opacity, backend, device))
         if len(out[-1].points) < 10 or not any(bool((d > 0).any()) for d in out[-1].depths):
             name = ("start", "end")[s.state]
-            raise UserError(f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)")
+            raise UserError(
+                f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)"
+            )
     return out
 
 
 def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[list, list[float]]:
-    """The ``candidates`` explanations that look best after a few steps at the smallest size, and the energies of all then."""
+    """The ``candidates`` explanations that look best after a few steps at the smallest size, and the energies of all
+    then."""
     if len(explanations) <= config.candidates:
         return explanations, []
     say(f"a quick look at {len(explanations)} explanations")
@@ -139,7 +104,8 @@ def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say)
 
 
 def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
-    """The explanation of lowest energy, refined and without parts that it is better without; which it was, and what each came to."""
+    """The explanation of lowest energy, refined and without parts that it is better without; which it was, and what
+    each came to."""
     refined, tried = [], []
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, judge.states)
@@ -154,10 +120,14 @@ def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) 
     return motions, {"explanation": number, "explanations": tried}
 
 
-def _improved(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
+def _improved(
+    judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig, say
+) -> tuple[PartMotions, dict]:
     """Types settled, bodies told apart, false minima left, each part reconsidered; what was done."""
     motions = settle_types(judge, motions, config.compare_types_below, config.freedom_penalty)
-    motions, bodies = one_part_a_body(judge.states, motions, labelled_surfaces(judge.found, motions.transforms, motions.types), limit)
+    motions, bodies = one_part_a_body(
+        judge.states, motions, labelled_surfaces(judge.found, motions.transforms, motions.types), limit
+    )
     if bodies:
         motions = judge.improved(motions)[2]
     changed: list[dict] = [{"change": "one part a body", **b} for b in bodies]
@@ -212,3 +182,45 @@ def _plain(value):
     if hasattr(value, "tolist"):
         return _plain(value.tolist())
     return str(value)
+
+
+@register_phase("discovery")
+class DiscoveryStage(Stage):
+    """Parts and motions, from both states' reconstructions and photographs: no training, so no losses, no callbacks."""
+
+    Config = PartMotionsConfig
+    trained = False
+
+    needs = ("states",)
+    gives = "motions"
+
+    @classmethod
+    def wanted(cls, run: RunContext) -> bool:
+        return run.init == "discovery"
+
+    @classmethod
+    def num_parts_key(cls, run: RunContext) -> Any:
+        """With ``exact_parts`` discovery finds what there is; later stages take it to the number that was asked for."""
+        return "auto" if run.exact else run.num_parts
+
+    @classmethod
+    def compute(cls, run: RunContext, section, *, states: list[StateGaussians]) -> PartMotions:
+        return find_part_motions(
+            states,
+            run.scene,
+            run.views,
+            "auto" if run.exact else run.num_parts,
+            section.config,
+            seed=run.seed,
+            backend=run.rasterizer,
+            device=run.device,
+            report=partial(run.log, cls.phase_name),
+        )
+
+    @classmethod
+    def hand_on(cls, run: RunContext, value: PartMotions, *, states: list[StateGaussians]) -> dict:
+        if run.exact:
+            value, notes = merge_to(value, states, run.num_parts)
+            for note in notes:
+                print(note, flush=True)
+        return {cls.gives: value}

@@ -1,8 +1,8 @@
-"""What every training phase shares: manual optimisation, loss bookkeeping, step-addressed randomness, resumable state."""
+"""What every training phase shares: manual optimisation, loss bookkeeping, step-addressed randomness, resumable
+state."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from p2gs.render import draws_natively
 from p2gs.stopping import leave_if_asked
 from p2gs.types import UserError
 
-__all__ = ["PHASES", "Phase", "PhaseConfig", "Stage", "exponential", "register_phase"]
+__all__ = ["PHASES", "Phase", "PhaseConfig", "Stage", "register_phase"]
 
 
 @dataclass
@@ -32,17 +32,12 @@ class PhaseConfig:
     steps: int = 1000
 
 
-def exponential(start: float, end: float, fraction: float) -> float:
-    """start at 0, end at 1, geometric between (both > 0)."""
-    return math.exp(math.log(start) + (math.log(end) - math.log(start)) * min(max(fraction, 0.0), 1.0))
-
-
 class Phase(LightningModule, Stage):
     """One training phase. Owns its Gaussians, rasterizer and whatever else it learns; hands over a small saved object.
 
     Subclasses give ``build`` (see ``models.stage``), ``parameter_groups`` (name -> (tensors, learning rate)),
-    ``learning_rates(step)`` and ``inputs(visit)``; the sum of the losses on those inputs is minimised with one Adam. Which
-    losses are on is the config's business. It trains from the run's LightningDataModule.
+    ``learning_rates(step)`` and ``inputs(visit)``; the sum of the losses on those inputs is minimised with one Adam.
+    Which losses are on is the config's business. It trains from the run's LightningDataModule.
 
     views: the photographs it looks at, of each state; none in a phase that renders none.  losses: name -> Loss.
     scalars: latest detached values by name, for callbacks to log.  seed: makes every random choice a pure function of
@@ -65,6 +60,8 @@ class Phase(LightningModule, Stage):
         self.loss_cache: dict = {}
         self.track_gradients = False  # set by the densification callback
 
+    #
+    #
     # -- what a subclass gives ------------------------------------------------------------------------------------------------
     def parameter_groups(self) -> dict[str, tuple[list[Tensor], float]]:
         """name -> (parameters, learning rate at step 0)."""
@@ -90,6 +87,8 @@ class Phase(LightningModule, Stage):
         """Numbers worth plotting that are no losses (joint parameters, part masses)."""
         return {}
 
+    #
+    #
     # -- what all share -------------------------------------------------------------------------------------------------------
     @property
     def step(self) -> int:
@@ -115,7 +114,9 @@ class Phase(LightningModule, Stage):
         return torch.Generator().manual_seed(number % 2**63)
 
     def configure_optimizers(self):
-        groups = [{"params": list(params), "lr": lr, "name": name} for name, (params, lr) in self.parameter_groups().items()]
+        groups = [
+            {"params": list(params), "lr": lr, "name": name} for name, (params, lr) in self.parameter_groups().items()
+        ]
         return NamedAdam([g for g in groups if g["params"]], eps=1e-15)
 
     def total_loss(self, inputs: LossInputs) -> Tensor:
@@ -144,7 +145,8 @@ class Phase(LightningModule, Stage):
             self.one_step(batch)
 
     def one_step(self, visit: Visit) -> None:
-        """Render, losses, backward pass, optimiser. Raises UserError where no Gaussian is left and where the loss is not finite."""
+        """Render, losses, backward pass, optimiser. Raises UserError where no Gaussian is left and where the loss is
+        not finite."""
         step = visit.step
         check_gaussians(self.phase_name, len(self.splats))
         optimizer: Any = self.optimizers()  # the one
@@ -158,7 +160,12 @@ class Phase(LightningModule, Stage):
         check_loss(self.phase_name, step, self.scalars)
         total.backward()
         render = inputs.render
-        if self.track_gradients and render is not None and render.means2d_abs_grad is not None and render.radii is not None:
+        if (
+            self.track_gradients
+            and render is not None
+            and render.means2d_abs_grad is not None
+            and render.radii is not None
+        ):
             # in units of the full image, so that levels of the resolution schedule weigh alike
             self.splats.note_gradients(render.means2d_abs_grad, render.radii, float(render.alpha.shape[0]))
         self.constrain_gradients()

@@ -36,12 +36,15 @@ def register_state(state: StateGaussians, found: Registration) -> StateGaussians
         return state
     g = dimmed(state.gaussians, -found.log_gain)
     labels = torch.ones(len(g), dtype=torch.long, device=g.means.device)
-    means, quats, sh = carry(g.means, g.quats, g.sh.contiguous(), Parts(labels), found.transform[None].to(g.means.device))
+    means, quats, sh = carry(
+        g.means, g.quats, g.sh.contiguous(), Parts(labels), found.transform[None].to(g.means.device)
+    )
     return replace(state, gaussians=GaussianTensors(means, quats, g.log_scales, g.opacity_logits, sh))
 
 
 def register_views(scene: TwoStateScene, found: Registration) -> TwoStateScene:
-    """The scene with the end's cameras, of all splits, in the start's frame, and its photographs as bright as the start's."""
+    """The scene with the end's cameras, of all splits, in the start's frame, and its photographs as bright as the
+    start's."""
     if found.is_identity:
         return scene
     back = se3.inverse(found.transform)
@@ -66,7 +69,8 @@ def correct_views(views: Iterable[View], corrections: ViewCorrections | None) ->
 
 
 def correct_scene(scene: TwoStateScene, states: list[StateGaussians]) -> TwoStateScene:
-    """The scene with the training photographs as the single states found them to be; the scene itself where they found no error."""
+    """The scene with the training photographs as the single states found them to be; the scene itself where they found
+    no error."""
     if all(s.corrections is None for s in states):
         return scene
     found = {s.state: iter(correct_views(scene.select(s.state, "train"), s.corrections)) for s in states}
@@ -74,25 +78,35 @@ def correct_scene(scene: TwoStateScene, states: list[StateGaussians]) -> TwoStat
 
 
 def write_registration(path: Path, found: Registration, states: list[StateGaussians], scene: TwoStateScene) -> None:
-    """RUN/registration.json, in input coordinates: what was applied to the photographs and what was measured.  scene: as it was read."""
+    """RUN/registration.json, in input coordinates: what was applied to the photographs and what was measured.  scene:
+    as it was read."""
     similarity, images = scene.similarity, []
     for s in states:
         if s.corrections is not None:
-            for view, motion, gain in zip(scene.select(s.state, "train"), s.corrections.motions, s.corrections.log_gains, strict=True):
+            for view, motion, gain in zip(
+                scene.select(s.state, "train"), s.corrections.motions, s.corrections.log_gains, strict=True
+            ):
                 told = {"motion": similarity.transform_to_input(motion).tolist(), "log_gain": gain.tolist()}
                 images.append({"state": s.state, "name": view.name, **told})
     rows = {"transform": similarity.transform_to_input(found.transform).tolist(), "log_gain": found.log_gain.tolist()}
-    path.write_text(json.dumps({"format": "p2gs-registration/1", **rows, "images": images, "figures": found.figures}, indent=1) + "\n")
+    path.write_text(
+        json.dumps({"format": "p2gs-registration/1", **rows, "images": images, "figures": found.figures}, indent=1)
+        + "\n"
+    )
 
 
 def read_registration(path: Path) -> tuple[Registration, dict[tuple[int, str], tuple[Tensor, Tensor]]]:
-    """What ``write_registration`` kept: the end's, and motion and gain by state and name of a photograph; nothing without a file."""
+    """What ``write_registration`` kept: the end's, and motion and gain by state and name of a photograph; nothing
+    without a file."""
     if not path.is_file():
         return Registration(torch.eye(4, dtype=torch.float64), torch.zeros(3)), {}
     stored = json.loads(path.read_text())
-    found = Registration(torch.tensor(stored["transform"], dtype=torch.float64), torch.tensor(stored["log_gain"]), stored["figures"])
+    found = Registration(
+        torch.tensor(stored["transform"], dtype=torch.float64), torch.tensor(stored["log_gain"]), stored["figures"]
+    )
     images = {
-        (i["state"], i["name"]): (torch.tensor(i["motion"], dtype=torch.float64), torch.tensor(i["log_gain"])) for i in stored["images"]
+        (i["state"], i["name"]): (torch.tensor(i["motion"], dtype=torch.float64), torch.tensor(i["log_gain"]))
+        for i in stored["images"]
     }
     return found, images
 
@@ -100,5 +114,8 @@ def read_registration(path: Path) -> tuple[Registration, dict[tuple[int, str], t
 def as_fitted(scene: TwoStateScene, run_dir: Path | str) -> TwoStateScene:
     """A scene in input coordinates with the cameras and exposures that a run's fit gave its photographs."""
     found, images = read_registration(Path(run_dir) / REGISTRATION)
-    views = (correct_view(v, *images[v.state, v.name]) if v.split == "train" and (v.state, v.name) in images else v for v in scene.views)
+    views = (
+        correct_view(v, *images[v.state, v.name]) if v.split == "train" and (v.state, v.name) in images else v
+        for v in scene.views
+    )
     return register_views(scene.with_views(views) if images else scene, found)

@@ -1,8 +1,9 @@
 """Where the end state stands against the start, and how much darker its photographs are: one rigid motion and one gain.
 
-Two reconstructions of one object are as far apart as the cameras of the two captures are; discovery would take that for motion, and joints
-would have it in them. The motion with the widest support near the identity is the base's (``surface_fit``); photographs refine it
-(``photo_fit``), and photographs held out of that decide whether it is applied. The same for the gain. Clean states stay as they are.
+Two reconstructions of one object are as far apart as the cameras of the two captures are; discovery would take that for
+motion, and joints would have it in them. The motion with the widest support near the identity is the base's
+(``surface_fit``); photographs refine it (``photo_fit``), and photographs held out of that decide whether it is applied.
+The same for the gain. Clean states stay as they are.
 """
 
 from __future__ import annotations
@@ -36,10 +37,11 @@ NOISE = 2e-4  # least noise of surfels, of the box's diagonal: discovery's
 class RegistrationConfig:
     """Options of the states' registration. Lengths are shares of the box's diagonal.
 
-    motion, gain: "auto" (held-out photographs decide) or "never".  reach: distance up to which unmoved surfaces are looked for; states
-    brought together by hand are off by about a hundredth.  steps: of refinement by photographs, a side and size.  sizes: of those
-    photographs, pixels.  surfels: at most so many a state.  least: share by which held-out errors must fall.  least_shift: a motion that
-    moves surfaces by less is not applied: a tenth of a pixel of the finest photographs.
+    motion, gain: "auto" (held-out photographs decide) or "never".  reach: distance up to which unmoved surfaces are
+    looked for; states brought together by hand are off by about a hundredth.  steps: of refinement by photographs, a
+    side and size.  sizes: of those photographs, pixels.  surfels: at most so many a state.  least: share by which
+    held-out errors must fall.  least_shift: a motion that moves surfaces by less is not applied: a tenth of a pixel of
+    the finest photographs.
     """
 
     motion: Literal["auto", "never"] = "auto"
@@ -61,7 +63,8 @@ def align_states(
     backend: str = "auto",
     report=None,
 ) -> Registration:
-    """The end's motion into the start's frame and its gain, each none where it is not wanted or held-out photographs are no better with it.
+    """The end's motion into the start's frame and its gain, each none where it is not wanted or held-out photographs
+    are no better with it.
 
     evidence: of both states, as discovery looks at them.  box: the object's, [2, 3].  All in internal coordinates.
     """
@@ -72,7 +75,10 @@ def align_states(
     if any(len(e.points) < 10 or not any(bool((d > 0).any()) for d in e.depths) for e in evidence):
         return Registration(still, dark)  # nothing opaque: discovery says so
     diagonal = float((box[1] - box[0]).norm())
-    surfels = [build_surfels(e, DepthStack(e.depths, e.alphas, e.cameras), diagonal, config.surfels, NOISE)[0] for e in evidence]
+    surfels = [
+        build_surfels(e, DepthStack(e.depths, e.alphas, e.cameras), diagonal, config.surfels, NOISE)[0]
+        for e in evidence
+    ]
     found = fit_surfaces(surfels[1], surfels[0], config.reach * diagonal)
     T = found.transform if config.motion == "auto" else still
     tolerance = 4 * (surfels[0].noise ** 2 + surfels[1].noise ** 2) ** 0.5 + 2e-3 * diagonal
@@ -99,7 +105,9 @@ def align_states(
     beside = f"{100 * shift:.3f} % of the object and {angle:.3f} degrees beside the start, by {100 * found.share:.0f} % of its surface"
     say(f"the end lies {beside}; {moved.told()}: {'applied' if apply_motion else 'not applied'}")
     factors = ", ".join(f"{g:.3f}" for g in gain.exp().tolist())
-    say(f"the end's red, green and blue are {factors} times the start's; {dimmer.told()}: {'applied' if apply_gain else 'not applied'}")
+    say(
+        f"the end's red, green and blue are {factors} times the start's; {dimmer.told()}: {'applied' if apply_gain else 'not applied'}"
+    )
     return Registration(best, gain if apply_gain else dark, figures)
 
 
@@ -122,7 +130,8 @@ class Pair:
 
     @torch.no_grad()
     def end_gain(self, transform: Tensor, picks: list[int], size: int) -> Tensor:
-        """Logarithm [3] of how much brighter the end's photographs are than the start's Gaussians where nothing moved: their median."""
+        """Logarithm [3] of how much brighter the end's photographs are than the start's Gaussians where nothing moved:
+        their median."""
         side, found = self.sides(torch.zeros(3))[0], []
         for index in picks:
             shot = photograph(self.views[1], index, size, self.start.means.device)
@@ -133,7 +142,8 @@ class Pair:
         return torch.stack(found).median(0).values if found else torch.zeros(3)
 
     def judges(self, picks: list[list[int]], size: int, transform: Tensor) -> list[tuple[int, TargetImage, Tensor]]:
-        """Held-out photographs of the end and of the start: the side, the picture, and where nothing moved by ``transform``."""
+        """Held-out photographs of the end and of the start: the side, the picture, and where nothing moved by
+        ``transform``."""
         out = []
         for turn, side in enumerate(self.sides(torch.zeros(3))):
             for index in picks[turn]:
@@ -145,7 +155,9 @@ class Pair:
     def errors(self, shots, transform: Tensor, gain: Tensor, ssim_lambda: float) -> Tensor:
         """Image loss [N] of ``judges`` under a motion and a gain."""
         sides = self.sides(gain)
-        return torch.stack([compare(sides[k], shot, weight, transform, self.backend, ssim_lambda) for k, shot, weight in shots]).cpu()
+        return torch.stack(
+            [compare(sides[k], shot, weight, transform, self.backend, ssim_lambda) for k, shot, weight in shots]
+        ).cpu()
 
 
 @register_phase("registration")
@@ -162,7 +174,9 @@ class RegistrationStage(Stage):
     def compute(cls, run: RunContext, section, *, states: list[StateGaussians]) -> Registration:
         say = partial(run.log, cls.phase_name)
         assert run.scene.box is not None  # every scene that is trained on has one
-        return align_states(states, evidence_of(run, states), run.views, run.scene.box, section.config, run.rasterizer, say)
+        return align_states(
+            states, evidence_of(run, states), run.views, run.scene.box, section.config, run.rasterizer, say
+        )
 
     @classmethod
     def hand_on(cls, run: RunContext, value: Registration, *, states: list[StateGaussians]) -> dict:

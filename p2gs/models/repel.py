@@ -1,4 +1,5 @@
-"""Where repel points are put: on the static base, near the parts that move (paper appendix, "Repel Point Initialization")."""
+"""Where repel points are put: on the static base, near the parts that move (paper appendix, "Repel Point
+Initialization")."""
 
 from __future__ import annotations
 
@@ -25,16 +26,16 @@ def place_repel_points(
     generator: torch.Generator | None = None,
     extent: float | None = None,
 ) -> Tensor:
-    """Static points nearer to a movable point than the threshold, ``count`` of them drawn uniformly without repetition: [R, 3].
+    """Static points nearer to a movable point than the threshold, ``count`` of them drawn uniformly without repetition:
+    [R, 3].
 
-    static_points [S, 3], movable_points [M, 3]: Gaussian centres in one common pose. R = min(count, how many are near); none near
-    (or no movable point) gives [0, 3].
-    threshold: a fraction of ``extent`` ("relative"; by default the diagonal of all points' box), a length ("absolute"; the paper
-    says 1.5, which takes in every point of an object of the benchmarks' size), or a multiple of the static points' median
-    nearest-neighbour distance ("spacing").
-    noise: length of an offset in a random direction (the paper's sigma_r, "3D offsets with magnitude sigma_r", times the extent). No
-    gradient.
-    Raises ValueError for another mode.
+    static_points [S, 3], movable_points [M, 3]: Gaussian centres in one common pose. R = min(count, how many are near);
+    none near (or no movable point) gives [0, 3].
+    threshold: a fraction of ``extent`` ("relative"; by default the diagonal of all points' box), a length ("absolute";
+    the paper says 1.5, which takes in every point of an object of the benchmarks' size), or a multiple of the static
+    points' median nearest-neighbour distance ("spacing").
+    noise: length of an offset in a random direction (the paper's sigma_r, "3D offsets with magnitude sigma_r", times
+    the extent). No gradient. Raises ValueError for another mode.
     """
     static, movable = static_points.detach(), movable_points.detach()
     if len(static) == 0 or len(movable) == 0 or count <= 0:
@@ -42,7 +43,11 @@ def place_repel_points(
     if extent is None:
         both = torch.cat([static, movable])
         extent = (both.amax(0) - both.amin(0)).norm().item()
-    reach = {"relative": lambda: threshold * extent, "absolute": lambda: threshold, "spacing": lambda: threshold * _spacing(static)}
+    reach = {
+        "relative": lambda: threshold * extent,
+        "absolute": lambda: threshold,
+        "spacing": lambda: threshold * _spacing(static),
+    }
     if mode not in reach:
         raise ValueError(f"threshold mode '{mode}' is not one of {', '.join(reach)}")
     distance, _ = search_tree(movable.cpu().numpy()).query(static.cpu().numpy())

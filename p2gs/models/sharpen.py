@@ -1,10 +1,12 @@
-"""Each state once more, drawn with sharp pixels: surfaces out to where they are, before the states are joined and joints polished.
+"""Each state once more, drawn with sharp pixels: surfaces out to where they are, before the states are joined and
+joints polished.
 
-With 3DGS's pixels (0.3 pixels^2 added to every Gaussian) and thick Gaussians a surface seen edge-on is a stack of faint rims. So that
-outlines come out right, training draws surfaces 0.4 to 0.8 pixels inward, more where a state shows them as outlines: a door's free edge
-when open, not when shut. Joints measured between the two are off by that. The loss ``depth_variance`` does its share (it would have rims
-thin, too), so it is not for this phase, which is too short for fog to come back. Parts are found before, in Gaussians as 3DGS leaves
-them: how well both states' static surfaces agree sets the scale of that search, and moving ones gain less from sharp pixels.
+With 3DGS's pixels (0.3 pixels^2 added to every Gaussian) and thick Gaussians a surface seen edge-on is a stack of faint
+rims. So that outlines come out right, training draws surfaces 0.4 to 0.8 pixels inward, more where a state shows them
+as outlines: a door's free edge when open, not when shut. Joints measured between the two are off by that. The loss
+``depth_variance`` does its share (it would have rims thin, too), so it is not for this phase, which is too short for
+fog to come back. Parts are found before, in Gaussians as 3DGS leaves them: how well both states' static surfaces agree
+sets the scale of that search, and moving ones gain less from sharp pixels.
 """
 
 from __future__ import annotations
@@ -25,9 +27,10 @@ from p2gs.render import with_pixels
 
 @dataclass
 class SharpenConfig(ImageConfig):
-    """Options of sharpening. steps: of each state (0 = off: all stages draw with the pixels of ``rasterizer``).  pixels: what this phase,
-    fusion, articulation and the last polish draw with ("sharp": ``rasterize(eps2d=0.1, antialias=True)``); the twin itself is
-    fitted in the end with those of ``rasterizer``, so that any 3DGS viewer shows it as it is.
+    """Options of sharpening. steps: of each state (0 = off: all stages draw with the pixels of ``rasterizer``).
+    pixels: what this phase, fusion, articulation and the last polish draw with ("sharp": ``rasterize(eps2d=0.1,
+    antialias=True)``); the twin itself is fitted in the end with those of ``rasterizer``, so that any 3DGS viewer shows
+    it as it is.
     """
 
     steps: int = 600
@@ -56,7 +59,9 @@ class SharpenPhase(StatePhase):
     def build(cls, run: RunContext, section, *, states: list[StateGaussians], state: int) -> "SharpenPhase":
         return cls(section.config, section.losses, states[state], run.views_of(state), **run.common())
 
-    def __init__(self, config: SharpenConfig, losses: dict[str, Loss], state: StateGaussians, views: TrainingViews, **common):
+    def __init__(
+        self, config: SharpenConfig, losses: dict[str, Loss], state: StateGaussians, views: TrainingViews, **common
+    ):
         super().__init__(config, losses, state.state, views, **common)
         self.splats = Splats(state.gaussians)
 

@@ -1,4 +1,5 @@
-"""Reconstruct one joint state: 3D Gaussian splatting (paper section 3; Kerbl et al. 2023, DOI 10.1145/3592433) in CPU minutes."""
+"""Reconstruct one joint state: 3D Gaussian splatting (paper section 3; Kerbl et al. 2023, DOI 10.1145/3592433) in CPU
+minutes."""
 
 from __future__ import annotations
 
@@ -18,9 +19,10 @@ from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.health import check_gaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
-from p2gs.models.phase import Phase, PhaseConfig, exponential, register_phase
+from p2gs.models.phase import Phase, PhaseConfig, register_phase
 from p2gs.models.registered import correct_scene
 from p2gs.models.view_fit import ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
+from p2gs.ops.decay import exponential
 from p2gs.types import Camera, GaussianTensors, RenderOutput, TwoStateScene
 from p2gs.visibility.share import visible_share
 
@@ -29,8 +31,9 @@ from p2gs.visibility.share import visible_share
 class ImageConfig(PhaseConfig):
     """Options of every phase that renders views.
 
-    levels: image sizes in pixels (long edge), coarse to fine; level_starts: fraction of the phase at which each begins. An image
-    smaller than a level is used as it is. background: colour behind the object while training ("random" changes every step).
+    levels: image sizes in pixels (long edge), coarse to fine; level_starts: fraction of the phase at which each begins.
+    An image smaller than a level is used as it is. background: colour behind the object while training ("random"
+    changes every step).
     """
 
     levels: list[int] = field(default_factory=lambda: [100, 200, 400])
@@ -64,10 +67,10 @@ class SingleStateConfig(ImageConfig):
     """Options of the single-state phase.
 
     steps: paper 30,000.  initial_gaussians: random points in the object's box (or depth points where ``init`` says so).
-    sh_degree: 0-3.  sh_every: steps until the next degree is switched on.  init: "auto" takes depth points where the scene has
-    depth, "random" never does.  initial_opacity: low, so that concavities stay open until the images fill them.  min_visible: Gaussians
-    of which no training view sees this share are left out at the end: nothing formed them (0 = keep all).  forgive: errors of single
-    photographs.
+    sh_degree: 0-3.  sh_every: steps until the next degree is switched on.  init: "auto" takes depth points where the
+    scene has depth, "random" never does.  initial_opacity: low, so that concavities stay open until the images fill
+    them.  min_visible: Gaussians of which no training view sees this share are left out at the end: nothing formed them
+    (0 = keep all).  forgive: errors of single photographs.
     """
 
     steps: int = 6000
@@ -108,11 +111,14 @@ class ImagePhase(Phase):
         views, step = self.views[visit.state], visit.step // len(self.views)
         background = self.background(step)
         picked = views.get(visit.view, views.levels.index(self.level(step)), background)
-        # the same view recurs with other backgrounds: statistics of the target may be cached only where it does not change
+        # the same view recurs with other backgrounds: statistics of the target may be cached only where it does not
+        # change
         key = picked.key if self.config.background != "random" else None
         device = self.splats.means.device
         depth = None if picked.depth is None else picked.depth.to(device)
-        return picked.camera.to(device), Target(picked.image.to(device), picked.alpha.to(device), background.to(device), depth, key)
+        return picked.camera.to(device), Target(
+            picked.image.to(device), picked.alpha.to(device), background.to(device), depth, key
+        )
 
     def picture(self, state: int):
         """The first training view of a state on white, at the finest level: what previews show."""
@@ -121,7 +127,9 @@ class ImagePhase(Phase):
         device = self.splats.means.device
         return dataclasses.replace(shot, image=shot.image.to(device), camera=shot.camera.to(device))
 
-    def render(self, g: GaussianTensors, camera: Camera, background: Tensor, sh_degree: int | None = None) -> RenderOutput:
+    def render(
+        self, g: GaussianTensors, camera: Camera, background: Tensor, sh_degree: int | None = None
+    ) -> RenderOutput:
         return render_gaussians(
             g,
             camera,
@@ -181,7 +189,13 @@ class SingleStatePhase(StatePhase):
         return {cls.gives: value}
 
     def __init__(
-        self, config: SingleStateConfig, losses: dict[str, Loss], scene: TwoStateScene, state: int, views: TrainingViews, **common
+        self,
+        config: SingleStateConfig,
+        losses: dict[str, Loss],
+        scene: TwoStateScene,
+        state: int,
+        views: TrainingViews,
+        **common,
     ):
         super().__init__(config, losses, state, views, **common)
         points, colours = initial_points(scene, state, config.initial_gaussians, config.init, self.generator(0, 2))
@@ -205,7 +219,8 @@ class SingleStatePhase(StatePhase):
         self.errors.learn(config.rate * exponential(1.0, 0.01, fraction))
 
     def forgive(self, step: int) -> None:
-        """At their steps: decide which errors of photographs are looked for, and measure the gains; photographs lose the gains known."""
+        """At their steps: decide which errors of photographs are looked for, and measure the gains; photographs lose
+        the gains known."""
         config, errors = self.config.forgive, self.errors
         due = [round(share * self.total_steps) for share in (config.at, *config.again)]
         if step == due[0] and not bool(errors.decided):
@@ -220,12 +235,17 @@ class SingleStatePhase(StatePhase):
     def decide(self) -> None:
         config, errors, g = self.config.forgive, self.errors, self.splats.tensors().detach()
         errors.decided.fill_(True)
-        for k, (wanted, name, judge) in enumerate(((config.gains, "gains", try_gains), (config.cameras, "cameras", try_cameras))):
+        for k, (wanted, name, judge) in enumerate(
+            ((config.gains, "gains", try_gains), (config.cameras, "cameras", try_cameras))
+        ):
             if wanted == "never":
                 continue
             found = judge(g, self.views[self.state], config, self.rasterizer)
             errors.on[k] = found.passed(config.least)
-            print(f"{self.phase_name}: {name} of single photographs: {found.told()}: {'on' if errors.on[k] else 'off'}", flush=True)
+            print(
+                f"{self.phase_name}: {name} of single photographs: {found.told()}: {'on' if errors.on[k] else 'off'}",
+                flush=True,
+            )
             if k == 0 and bool(errors.on[0]):
                 self.measure()
                 self.forgive(-1)  # the cameras are judged by photographs without gains

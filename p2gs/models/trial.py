@@ -1,4 +1,5 @@
-"""Does a correction of the photographs make held-out ones better beyond noise? The one test by which corrections are switched on."""
+"""Does a correction of the photographs make held-out ones better beyond noise? The one test by which corrections are
+switched on."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ CERTAIN = 3.0  # standard errors: one in a thousand by chance
 
 @dataclass(frozen=True)
 class Trial:
-    """without, with_it: mean errors of the held-out pictures.  better: share by which they fell, mean over pictures.  certain: the same
-    in standard errors.  pictures: how many."""
+    """without, with_it: mean errors of the held-out pictures.  better: share by which they fell, mean over pictures.
+    certain: the same in standard errors.  pictures: how many."""
 
     without: float
     with_it: float

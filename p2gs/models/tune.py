@@ -1,7 +1,7 @@
 """The Gaussians once more, with the final labels and motions held fixed: the photographs of both states decide alone.
 
-While motions are learned the Gaussians bend to whatever they happen to be, and to the terms that teach parts; once both stand, surfaces and
-colours still have to follow.
+While motions are learned the Gaussians bend to whatever they happen to be, and to the terms that teach parts; once both
+stand, surfaces and colours still have to follow.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
+from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.adam import NamedAdam
-from p2gs.models.single_state import SplatRates, render_gaussians
+from p2gs.models.single_state import SplatRates
 from p2gs.native import serial_torch
 from p2gs.ops import se3
 from p2gs.ops.carry import RigidMoves
@@ -26,8 +27,8 @@ from p2gs.types import GaussianTensors
 
 @dataclass
 class TuneConfig:
-    """Options of the last fit of the Gaussians. steps: over both states, in turn (0 = off).  levels: image sizes (long edge, pixels), of
-    which the last is used."""
+    """Options of the last fit of the Gaussians. steps: over both states, in turn (0 = off).  levels: image sizes (long
+    edge, pixels), of which the last is used."""
 
     steps: int = 900
     levels: list[int] = field(default_factory=lambda: [400])
@@ -49,8 +50,8 @@ def tune(
 ) -> GaussianTensors:
     """The Gaussians (at canonical ``time``) fitted to the photographs of both states under fixed motions.
 
-    labels [N]; transforms [K-1, 4, 4] start -> end; views: photographs by state; losses: of these the ones of kind ``image`` count; without
-    any nothing changes.  Returns new Gaussians, detached, on the CPU.
+    labels [N]; transforms [K-1, 4, 4] start -> end; views: photographs by state; losses: of these the ones of kind
+    ``image`` count; without any nothing changes.  Returns new Gaussians, detached, on the CPU.
     """
     # priors on surfaces have had their say, and cost more PSNR here than they gain in shape
     losses = {name: loss for name, loss in losses.items() if loss.kind == "image"}
@@ -59,7 +60,9 @@ def tune(
     splats, labels = Splats(gaussians).to(device), labels.to(device)
     moves = [RigidMoves(labels, se3.screw_at(transforms, state - time).to(device)) for state in (0, 1)]
     rates = config.rates.at(0.0)
-    optimizer = NamedAdam([{"params": [getattr(splats, name)], "lr": rate, "name": name} for name, rate in rates.items()], eps=1e-15)
+    optimizer = NamedAdam(
+        [{"params": [getattr(splats, name)], "lr": rate, "name": name} for name, rate in rates.items()], eps=1e-15
+    )
     cache: dict = {}
 
     def one_step(step: int) -> None:
@@ -69,7 +72,9 @@ def tune(
             group["lr"] = rates[group["name"]]
         of = views[state]
         background = torch.rand(3, generator=torch.Generator().manual_seed(seed * 1_000_003 + step))
-        shot = of.get(view_index(seed + 7919 * state + 31, step // 2, len(of)), of.levels.index(config.levels[-1]), background)
+        shot = of.get(
+            view_index(seed + 7919 * state + 31, step // 2, len(of)), of.levels.index(config.levels[-1]), background
+        )
         depth = None if shot.depth is None else shot.depth.to(device)
         camera, background = shot.camera.to(device), background.to(device)
         target = Target(shot.image.to(device), shot.alpha.to(device), background, depth)

@@ -1,9 +1,10 @@
-"""Small errors of single photographs, found beside the Gaussians: each one's exposure and white balance, and its camera.
+"""Small errors of single photographs, found beside the Gaussians: each one's exposure and white balance, and its
+camera.
 
-A camera goes from V to V exp(xi), xi a twist in world coordinates about the origin (the middle of the object's box): all of them moved
-alike would be the object moved, so the mean of xi is held at zero. So is that of the gains' logarithms: a colour cast of all photographs
-is the object's colour. What is on is decided by the photographs themselves: each is halved like a chessboard, and what is fitted to one
-half must explain the other half better.
+A camera goes from V to V exp(xi), xi a twist in world coordinates about the origin (the middle of the object's box):
+all of them moved alike would be the object moved, so the mean of xi is held at zero. So is that of the gains'
+logarithms: a colour cast of all photographs is the object's colour. What is on is decided by the photographs
+themselves: each is halved like a chessboard, and what is fitted to one half must explain the other half better.
 """
 
 from __future__ import annotations
@@ -32,11 +33,10 @@ FIELDS = 8  # a side: each half of a photograph shows something of every part
 class ViewFitConfig:
     """What may be wrong with single photographs.
 
-    gains, cameras: "auto" (photographs decide, once, when the share ``at`` of the phase is done) or "never".  again: gains are measured
-    anew at these shares.  levels: the size of the photographs that decide, pixels; judges: how
-    many.  steps: of a camera's fit to half a
-    photograph.  rate: of the cameras' Adam in internal units, falling to a hundredth.  least: share by which the other halves' errors
-    must fall.
+    gains, cameras: "auto" (photographs decide, once, when the share ``at`` of the phase is done) or "never".  again:
+    gains are measured anew at these shares.  levels: the size of the photographs that decide, pixels; judges: how many.
+    steps: of a camera's fit to half a photograph.  rate: of the cameras' Adam in internal units, falling to a
+    hundredth.  least: share by which the other halves' errors must fall.
     """
 
     gains: Literal["auto", "never"] = "never"
@@ -51,7 +51,8 @@ class ViewFitConfig:
 
 
 class RowAdam:
-    """Adam for a table of rows that are looked at one at a time (Kingma and Ba 2015, arXiv:1412.6980): a row's moments move with it alone.
+    """Adam for a table of rows that are looked at one at a time (Kingma and Ba 2015, arXiv:1412.6980): a row's moments
+    move with it alone.
 
     table [V, D]: changed in place.  moments [V, 2 D + 1]: both, and the steps taken.
     """
@@ -71,7 +72,8 @@ class RowAdam:
 class ViewErrors(nn.Module):
     """The errors of V photographs of one state: buffers, so that a checkpoint has them.
 
-    twists [V, 6] and log_gains [V, 3], float64; their means are zero.  on [2] bool: gains, cameras; decided: whether that is known.
+    twists [V, 6] and log_gains [V, 3], float64; their means are zero.  on [2] bool: gains, cameras; decided: whether
+    that is known.
     """
 
     twists: Tensor
@@ -90,7 +92,8 @@ class ViewErrors(nn.Module):
         self._looked_at: tuple[int, Tensor] | None = None
 
     def camera(self, index: int, camera: Camera) -> Camera:
-        """The photograph's camera, with a gradient by its twist that ``learn`` takes up; the very camera where cameras are off."""
+        """The photograph's camera, with a gradient by its twist that ``learn`` takes up; the very camera where cameras
+        are off."""
         self._looked_at = None
         if not bool(self.on[1]):
             return camera
@@ -120,7 +123,8 @@ class ViewErrors(nn.Module):
 
 @torch.no_grad()
 def measure_gains(g: GaussianTensors, views: TrainingViews, size: int, backend: str) -> Tensor:
-    """Natural logarithm [V, 3], float64, of how much brighter each photograph is than its rendering, mean zero; 0 where none can tell."""
+    """Natural logarithm [V, 3], float64, of how much brighter each photograph is than its rendering, mean zero; 0 where
+    none can tell."""
     found = torch.zeros(len(views), 3, dtype=torch.float64)
     for index in range(len(views)):
         shot = photograph(views, index, size, g.means.device)
@@ -139,7 +143,8 @@ def halves(height: int, width: int) -> list[Tensor]:
 
 @torch.no_grad()
 def try_gains(g: GaussianTensors, views: TrainingViews, config: ViewFitConfig, backend: str) -> Trial:
-    """Errors of half photographs without and with the gain that their other half tells, as it differs from the photographs' mean."""
+    """Errors of half photographs without and with the gain that their other half tells, as it differs from the
+    photographs' mean."""
     drawn = []
     for index in views.spread(config.judges):
         shot = photograph(views, index, config.levels[0], g.means.device)

@@ -1,7 +1,8 @@
 """Which surface both states show: nothing else can tell where a part went.
 
-A drawer's tray shows in one state alone, a flap its front in one and its back in the other, a dim inside is rebuilt otherwise in either. Under the
-true motion such surface explains no photograph of the other state, and photographs would pull the motion to where it covers more of it.
+A drawer's tray shows in one state alone, a flap its front in one and its back in the other, a dim inside is rebuilt
+otherwise in either. Under the true motion such surface explains no photograph of the other state, and photographs would
+pull the motion to where it covers more of it.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.models.canonical import with_static
+from p2gs.gaussians.pose import with_static
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
@@ -23,18 +24,21 @@ from p2gs.visibility.free_space import landed
 
 SOLID = 0.5  # opacity from which on a Gaussian is surface
 EXTENT = 3.0  # standard deviations at which a Gaussian ends for the eye
-_UNMOVED: WeakKeyDictionary[DepthStack, tuple] = WeakKeyDictionary()  # what ``unmoved`` found last: Gaussians, tolerance, result
+# what ``unmoved`` found last: Gaussians, tolerance, result
+_UNMOVED: WeakKeyDictionary[DepthStack, tuple] = WeakKeyDictionary()
 NEIGHBOURS = 4  # of the other state's Gaussians, one of which must be like the one that lands there
 
 
 def kept_and_shown(
     states: list[StateGaussians], motions: PartMotions, state: int, stacks: list[DepthStack], config: PolishConfig
 ) -> tuple[Tensor, Tensor]:
-    """Of the Gaussians of ``state``, [N] bool each: which nothing contradicts in the other state, and which the other state shows.
+    """Of the Gaussians of ``state``, [N] bool each: which nothing contradicts in the other state, and which the other
+    state shows.
 
-    Carried to the other state by its part's motion a Gaussian is shown there where most views see it on a surface of the same part, of like
-    colour and from the side that its own state shows. It is contradicted where they see through it or its ends (it reaches over the edge of
-    what it was labelled with), and where it lies on a surface that is not like it. Inside and behind, where nobody looks, nothing is.
+    Carried to the other state by its part's motion a Gaussian is shown there where most views see it on a surface of
+    the same part, of like colour and from the side that its own state shows. It is contradicted where they see through
+    it or its ends (it reaches over the edge of what it was labelled with), and where it lies on a surface that is not
+    like it. Inside and behind, where nobody looks, nothing is.
     stacks: rendered depth of both states.
     """
     g, labels = states[state].gaussians, motions.labels[state]
@@ -54,13 +58,15 @@ def kept_and_shown(
 
 
 def met(stack: DepthStack, points: Tensor, tau: float) -> tuple[Tensor, Tensor]:
-    """[N] bool each: do most views of a state see these points [N, 3] on a surface, do they see through them? tau: tolerance (internal units)."""
+    """[N] bool each: do most views of a state see these points [N, 3] on a surface, do they see through them? tau:
+    tolerance (internal units)."""
     free, seen, _ = stack.counts(points.contiguous(), tau)
     return classify(free, seen)[1], classify(free, seen, need=4, ratio=2.0)[0]
 
 
 def unmoved(g: GaussianTensors, stack: DepthStack, tau: float) -> tuple[Tensor, Tensor]:
-    """``met`` by Gaussians [N] where they are and, seen through, also by their ends. Found once for a stack: no motion changes it."""
+    """``met`` by Gaussians [N] where they are and, seen through, also by their ends. Found once for a stack: no motion
+    changes it."""
     known = _UNMOVED.get(stack)
     if known is None or known[0] is not g or known[1] != tau:
         on, through = met(stack, g.means, tau)
@@ -79,7 +85,8 @@ def ends(g: GaussianTensors) -> list[Tensor]:
 
 
 def alike(states: list[StateGaussians], motions: PartMotions, state: int, at: Tensor, other_colour: float) -> Tensor:
-    """[N] bool: is one of the other state's solid Gaussians next to ``at`` [N, 3] of the same part and of like colour (0..1, mean of channels)?"""
+    """[N] bool: is one of the other state's solid Gaussians next to ``at`` [N, 3] of the same part and of like colour
+    (0..1, mean of channels)?"""
     g, other = states[state].gaussians, states[1 - state].gaussians
     solid = (torch.sigmoid(other.opacity_logits) > SOLID).nonzero().squeeze(1)
     if len(solid) < NEIGHBOURS:
@@ -91,7 +98,8 @@ def alike(states: list[StateGaussians], motions: PartMotions, state: int, at: Te
 
 
 class ShownPixels:
-    """How much of each pixel of a state's views is background or surface that the other state shows, too. Drawn when first asked for.
+    """How much of each pixel of a state's views is background or surface that the other state shows, too. Drawn when
+    first asked for.
 
     shown [N] bool: which of the state's Gaussians are (``kept_and_shown``).
     """
@@ -106,6 +114,8 @@ class ShownPixels:
         """[H, W] in 0..1 of photograph ``view`` in size ``level``, of which this is the camera."""
         if (view, level) not in self.drawn:
             g = self.body.g
-            out = self.body.render(g.means, self.body.quats, g.sh, camera, torch.zeros(3), self.backend, features=self.shown)
+            out = self.body.render(
+                g.means, self.body.quats, g.sh, camera, torch.zeros(3), self.backend, features=self.shown
+            )
             self.drawn[view, level] = (out.features[..., 0] + 1 - out.alpha.reshape(out.features.shape[:2])).clamp(0, 1)
         return self.drawn[view, level]

@@ -1,7 +1,7 @@
 """How far a joint can be trusted, measured on what both states show. No ground truth, no learning.
 
-Each state's Gaussians are carried to the other state by the joint. There they should lie on surfaces, look like the photographs, look
-worse after any small change of the joint, and the two directions should tell the same motion.
+Each state's Gaussians are carried to the other state by the joint. There they should lie on surfaces, look like the
+photographs, look worse after any small change of the joint, and the two directions should tell the same motion.
 """
 
 from __future__ import annotations
@@ -20,12 +20,15 @@ from p2gs.types import Camera
 from p2gs.visibility.depth_stack import DepthStack, classify
 from p2gs.visibility.evidence import render_depths
 
-STEP = 0.02  # displacement of a part by a change of its joint, internal units (the object's diagonal is 2): one per cent
+# displacement of a part by a change of its joint, internal units (the object's diagonal is 2): one per cent
+STEP = 0.02
 BRIGHT = 0.15  # |render - photo| that one sees
 ON_SURFACE = 0.02  # tolerance along the ray of the free-space test, internal units
 RISE = (0.003, 0.1)  # less tells nothing, more tells no more: how far the residual rises less how far it falls
-APART, UNTOLD = 0.001, 0.01  # internal units: directions that differ by less agree; what counts where they were not told apart
-# How each feature counts, and the constant: fitted by bench/confidence.py to right and wrong joints of scenes of the zoo's tuning set
+# internal units: directions that differ by less agree; what counts where they were not told apart
+APART, UNTOLD = (0.001, 0.01)
+# How each feature counts, and the constant: fitted by bench/confidence.py to right and wrong joints of scenes of the
+# zoo's tuning set
 WEIGHTS = (3.8, 0.85, 0.31, 3.05)
 
 
@@ -33,13 +36,16 @@ WEIGHTS = (3.8, 0.85, 0.31, 3.05)
 class JointEvidence:
     """What the images say of one joint.
 
-    coverage: share of the part's Gaussians that land on a surface of the other state (the better of the two directions: a shut drawer
-    hides its inside).  contradicted: share that lands where the other state's cameras see through (the worse direction).
+    coverage: share of the part's Gaussians that land on a surface of the other state (the better of the two directions:
+    a shut drawer hides its inside).  contradicted: share that lands where the other state's cameras see through (the
+    worse direction).
     residual: mean |render - photo| over the part's pixels, as a multiple of the static part's there.
-    rise: relative growth of that residual when the part is displaced by ``STEP``, mean of both signs, in the direction that
-    matters least: the curvature of the photometric cost.  fall: how much it falls in the best of those directions: 0 at a minimum.
-    disagreement: mean distance between the points where the start -> end and the end -> start refinement put the part (internal
-    units; None where there was no such refinement).  views: how many photographs showed enough of the part to be measured.
+    rise: relative growth of that residual when the part is displaced by ``STEP``, mean of both signs, in the direction
+    that matters least: the curvature of the photometric cost.  fall: how much it falls in the best of those directions:
+    0 at a minimum.
+    disagreement: mean distance between the points where the start -> end and the end -> start refinement put the part
+    (internal units; None where there was no such refinement).  views: how many photographs showed enough of the part to
+    be measured.
     """
 
     coverage: float
@@ -52,8 +58,8 @@ class JointEvidence:
 
     @property
     def confidence(self) -> float:
-        """Probability that the joint is right (axis and turn within a degree, slide within 0.01, position x10 within 0.15): a logistic
-        function of ``features``. 0 where no view shows the part."""
+        """Probability that the joint is right (axis and turn within a degree, slide within 0.01, position x10 within
+        0.15): a logistic function of ``features``. 0 where no view shows the part."""
         if self.views == 0:
             return 0.0
         return 1 / (1 + math.exp(-sum(w * x for w, x in zip(WEIGHTS, [*features(self), 1.0], strict=True))))
@@ -64,8 +70,9 @@ class JointEvidence:
 
 
 def features(e: JointEvidence) -> list[float]:
-    """What speaks for a joint, each the more the better: that nothing contradicts it, that the residual rises where it is displaced and
-    falls nowhere, that both directions agree. The last two as logarithms: they span decades. Coverage and residual got no weight."""
+    """What speaks for a joint, each the more the better: that nothing contradicts it, that the residual rises where it
+    is displaced and falls nowhere, that both directions agree. The last two as logarithms: they span decades. Coverage
+    and residual got no weight."""
     least, most = RISE
     apart = UNTOLD if e.disagreement is None else max(e.disagreement, APART)
     return [-e.contradicted, math.log(min(max(e.rise - e.fall, least), most)), -math.log(apart)]
@@ -74,8 +81,9 @@ def features(e: JointEvidence) -> list[float]:
 def landing(
     state: StateGaussians, labels: Tensor, transforms: Tensor, stack: DepthStack, min_opacity: float = 0.5
 ) -> list[tuple[float, float]]:
-    """Per movable part (share on a surface, share seen through) of its solid Gaussians carried by ``transforms`` [K-1, 4, 4] into the
-    state whose rendered depth is ``stack``; the rest lands behind something. (0, 0) for an empty part."""
+    """Per movable part (share on a surface, share seen through) of its solid Gaussians carried by ``transforms`` [K-1,
+    4, 4] into the state whose rendered depth is ``stack``; the rest lands behind something. (0, 0) for an empty
+    part."""
     solid = torch.sigmoid(state.gaussians.opacity_logits) > min_opacity
     out = []
     for k in range(len(transforms)):
@@ -112,10 +120,11 @@ def state_depth(
 
 
 def nudges(kind: str, T: Tensor, centre: Tensor, radius: float, size: float = STEP) -> list[tuple[Tensor, Tensor]]:
-    """Small changes of a joint, each as the pair (forth, back) of changed motions [4, 4]: every degree of freedom of its type.
+    """Small changes of a joint, each as the pair (forth, back) of changed motions [4, 4]: every degree of freedom of
+    its type.
 
-    Revolute: about the axis, two tilts, two shifts across the axis; prismatic: along three directions; displacing points at
-    ``radius`` from ``centre`` (the moved part's middle) by ``size``.
+    Revolute: about the axis, two tilts, two shifts across the axis; prismatic: along three directions; displacing
+    points at ``radius`` from ``centre`` (the moved part's middle) by ``size``.
     """
     turn = kind != "prismatic"
     axis = se3.screw_parameters(T).axis if turn else torch.nn.functional.normalize(T[:3, 3], dim=0)
@@ -136,11 +145,12 @@ def nudges(kind: str, T: Tensor, centre: Tensor, radius: float, size: float = ST
 class CrossViews:
     """One state's Gaussians carried into the other state's photographs: residuals of a part in its own pixels.
 
-    labels [N]: part of each Gaussian, 0 static.  transforms [K-1, 4, 4] carry this state to the photographs'.  Photographs: ``looks``
-    of them at size ``level``, spread over ``views``; each part is measured on the ``count`` that show most of it.
+    labels [N]: part of each Gaussian, 0 static.  transforms [K-1, 4, 4] carry this state to the photographs'.
+    Photographs: ``looks`` of them at size ``level``, spread over ``views``; each part is measured on the ``count`` that
+    show most of it.
 
-    static_error: mean |render - photo| where the static part shows.  bright_static: share of the object's pixels where the static
-    part shows and is off by more than ``BRIGHT``.
+    static_error: mean |render - photo| where the static part shows.  bright_static: share of the object's pixels where
+    the static part shows and is off by more than ``BRIGHT``.
     """
 
     def __init__(
@@ -159,7 +169,11 @@ class CrossViews:
             self.shares.append(share)
             self.errors.append((colour - shot.image).abs().mean(-1))
         parts = len(transforms) + 1
-        areas = torch.stack([(s[..., 1:] > 0.3).float().mean((0, 1)) for s in self.shares]) if parts > 1 else torch.zeros(len(picked), 0)
+        areas = (
+            torch.stack([(s[..., 1:] > 0.3).float().mean((0, 1)) for s in self.shares])
+            if parts > 1
+            else torch.zeros(len(picked), 0)
+        )
         order = areas.argsort(dim=0, descending=True, stable=True)
         self.chosen = [[int(i) for i in order[:count, k] if areas[int(i), k] > 1e-3] for k in range(parts - 1)]
         near = [torch.nn.functional.max_pool2d(s.permute(2, 0, 1)[None], 7, 1, 3)[0] > 0.3 for s in self.shares]
@@ -180,18 +194,22 @@ class CrossViews:
         first = self.body.render(means, quats, sh, camera, self.background, self.backend, features=onehot[:, :16])
         shares = [first.features]
         for columns in onehot[:, 16:].split(16, 1) if parts > 16 else ():
-            shares.append(self.body.render(means, quats, sh, camera, self.background, self.backend, features=columns).features)
+            shares.append(
+                self.body.render(means, quats, sh, camera, self.background, self.backend, features=columns).features
+            )
         return first.colour.cpu(), torch.cat(shares, -1).cpu()
 
     def window(self, shot: int, region: Tensor) -> tuple[Camera, Tensor, Tensor]:
-        """The part of a photograph around ``region`` [H, W]: its camera, its pixels [h, w, 3] and the region in it [h, w]."""
+        """The part of a photograph around ``region`` [H, W]: its camera, its pixels [h, w, 3] and the region in it [h,
+        w]."""
         rows, cols = region.any(1).nonzero().squeeze(1), region.any(0).nonzero().squeeze(1)
         y, x, bottom, right = int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1
         camera = self.shots[shot].camera.cropped(x, y, right - x, bottom - y)
         return camera, self.shots[shot].image[y:bottom, x:right], region[y:bottom, x:right]
 
     def part_error(self, part: int, transform: Tensor) -> float:
-        """Mean |render - photo| over the pixels that movable part ``part`` (0-based) covers, when its motion is ``transform`` [4, 4]."""
+        """Mean |render - photo| over the pixels that movable part ``part`` (0-based) covers, when its motion is
+        ``transform`` [4, 4]."""
         motions = self.transforms.clone()
         motions[part] = transform
         total = pixels = 0.0
@@ -209,9 +227,9 @@ def measure_joints(
 ) -> list[JointEvidence]:  # fmt: skip
     """The evidence for every joint.
 
-    labels: part ids of each state's Gaussians.  transforms [K-1, 4, 4] start -> end.  views: photographs by state.  stacks: rendered
-    depth of both states.  level: image size.  both: the motions that the start -> end and the end -> start refinement found
-    (both start -> end), where there were two.  looks, count: as in ``CrossViews``.
+    labels: part ids of each state's Gaussians.  transforms [K-1, 4, 4] start -> end.  views: photographs by state.
+    stacks: rendered depth of both states.  level: image size.  both: the motions that the start -> end and the end ->
+    start refinement found (both start -> end), where there were two.  looks, count: as in ``CrossViews``.
     """
     ways = [transforms.double(), se3.inverse(transforms.double())]
     options = {"level": level, "looks": looks, "count": count, "backend": backend, "device": device}

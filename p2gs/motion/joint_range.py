@@ -1,7 +1,8 @@
 """How far a joint can go on beyond the two photographed states: until its part runs into another one.
 
-The parts are surface points (the twin's solid Gaussians). A point runs into a surface when it passes one of its points, within about a
-point spacing sideways, and that surface faces the motion; a wall that the part slides along does not stop it.
+The parts are surface points (the twin's solid Gaussians). A point runs into a surface when it passes one of its points,
+within about a point spacing sideways, and that surface faces the motion; a wall that the part slides along does not
+stop it.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ class Obstacles:
 
     @staticmethod
     def of(points: np.ndarray, neighbours: int = 12) -> "Obstacles":
-        """Normals by principal axes of the nearest neighbours; lone points (three times the usual distance from their neighbours) go."""
+        """Normals by principal axes of the nearest neighbours; lone points (three times the usual distance from their
+        neighbours) go."""
         k = min(neighbours, len(points) - 1)
         if k < 3:
             return Obstacles(np.zeros((0, 3)), np.zeros((0, 3)), 1.0)
@@ -48,8 +50,8 @@ class Obstacles:
 
 
 def passed(before: np.ndarray, after: np.ndarray, obstacles: Obstacles, sideways: float) -> np.ndarray:
-    """Pairs (moving point, obstacle) [M, 2] of a step ``before`` -> ``after`` [P, 3]: the obstacle faces the step and lies along it, at
-    most ``sideways`` beside it."""
+    """Pairs (moving point, obstacle) [M, 2] of a step ``before`` -> ``after`` [P, 3]: the obstacle faces the step and
+    lies along it, at most ``sideways`` beside it."""
     if not len(obstacles.points):
         return np.zeros((0, 2), dtype=np.int64)
     step = after - before
@@ -64,7 +66,13 @@ def passed(before: np.ndarray, after: np.ndarray, obstacles: Obstacles, sideways
     along = np.einsum("ni,ni->n", gap, u[row])
     beside = np.linalg.norm(gap - along[:, None] * u[row], axis=1)
     faces = np.abs(np.einsum("ni,ni->n", obstacles.normals[j], u[row])) > FACING
-    hit = (along >= 0) & (along <= length[row]) & (beside < sideways) & faces & (length[row] > 0.1 * length.max(initial=0.0))
+    hit = (
+        (along >= 0)
+        & (along <= length[row])
+        & (beside < sideways)
+        & faces
+        & (length[row] > 0.1 * length.max(initial=0.0))
+    )
     return np.stack([row[hit], j[hit]], 1)
 
 
@@ -91,9 +99,10 @@ def extended_limits(
 ) -> tuple[float, float]:
     """The joint's limits (lo, hi), 0 = start, followed on beyond both observed states until the part touches.
 
-    points [N, 3]: of the part at the start.  others_start, others_end: the other parts in both states; each end of the range is followed
-    among the others as they were photographed there.  farthest: length beyond which no slide is followed, degrees are limited to
-    ``FULL_TURN``. What the part passed through between the states cannot be in its way and is left out.
+    points [N, 3]: of the part at the start.  others_start, others_end: the other parts in both states; each end of the
+    range is followed among the others as they were photographed there.  farthest: length beyond which no slide is
+    followed, degrees are limited to ``FULL_TURN``. What the part passed through between the states cannot be in its way
+    and is left out.
     """
     points = points[np.linspace(0, len(points) - 1, min(POINTS, len(points))).round().astype(int)]
     most = FULL_TURN if joint.type == "revolute" else farthest
@@ -128,7 +137,8 @@ def harmless(joint: Joint, points: np.ndarray, others: Obstacles, step: float) -
 
 
 def extend_ranges(obj: ArticulatedObject, min_opacity: float = 0.5) -> list[Part]:
-    """The parts of a twin with their joints' limits followed on until they touch; the observed ones where a part has too few points."""
+    """The parts of a twin with their joints' limits followed on until they touch; the observed ones where a part has
+    too few points."""
     solid = torch.sigmoid(obj.gaussians.opacity_logits) > min_opacity
     at = {t: {p.id: points_at(obj, p, solid, t) for p in obj.parts} for t in (0.0, 1.0)}
     everything = np.concatenate([*at[0.0].values(), *at[1.0].values()])

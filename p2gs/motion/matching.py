@@ -1,4 +1,5 @@
-"""What of two reconstructions corresponds, and how much moved: motion richness D, beta, Hungarian pairs (paper section 4.1)."""
+"""What of two reconstructions corresponds, and how much moved: motion richness D, beta, Hungarian pairs (paper section
+4.1)."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ STILL = 0.02  # share of the largest squared motion below which a pair counts as
 
 
 def motion_richness(a: Tensor, b: Tensor, trim: float = 0.0) -> float:
-    """D^{a->b} = E_i min_j ||a_i - b_j|| (paper Eq. D, unsquared), the largest ``trim`` of the distances left out. a [N, 3], b [M, 3]."""
+    """D^{a->b} = E_i min_j ||a_i - b_j|| (paper Eq. D, unsquared), the largest ``trim`` of the distances left out. a
+    [N, 3], b [M, 3]."""
     distance = knn(b, a, 1, False)[0][:, 0]
     keep = max(int(round(len(distance) * (1 - trim))), 1)
     return float(distance.sort().values[:keep].mean())
@@ -33,16 +35,23 @@ def farthest_points(points: Tensor, count: int) -> Tensor:
     nearest = torch.full((n,), float("inf"))
     for i in range(1, count):
         last = columns[:, picked[i - 1]]
-        distance = (columns[0] - last[0]).square_().add_((columns[1] - last[1]).square_()).add_((columns[2] - last[2]).square_())
+        distance = (
+            (columns[0] - last[0])
+            .square_()
+            .add_((columns[1] - last[1]).square_())
+            .add_((columns[2] - last[2]).square_())
+        )
         torch.minimum(nearest, distance, out=nearest)
         picked[i] = nearest.argmax()
     return picked
 
 
 def hungarian_pairs(a: Tensor, b: Tensor, count: int, smaller_whole: bool = False) -> tuple[Tensor, Tensor]:
-    """Match farthest points of a [N, 3] and b [M, 3] by least total distance (paper section 4.1). Returns indices (into a, into b).
+    """Match farthest points of a [N, 3] and b [M, 3] by least total distance (paper section 4.1). Returns indices (into
+    a, into b).
 
-    count: farthest points of each that are matched; with ``smaller_whole`` of the larger set only, every point of the smaller one is.
+    count: farthest points of each that are matched; with ``smaller_whole`` of the larger set only, every point of the
+    smaller one is.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -56,7 +65,8 @@ def hungarian_pairs(a: Tensor, b: Tensor, count: int, smaller_whole: bool = Fals
 
 
 def motion_clusters(start: Tensor, end: Tensor, clusters: int, rounds: int = 20) -> Tensor:
-    """Pairs [M, 3] of both states in ``clusters`` groups that move: 0 (still) .. clusters, [M] int64. For parts before any are known.
+    """Pairs [M, 3] of both states in ``clusters`` groups that move: 0 (still) .. clusters, [M] int64. For parts before
+    any are known.
 
     k-means on (where a pair begins, where it ends), begun at farthest points; deterministic.
     """
@@ -69,6 +79,8 @@ def motion_clusters(start: Tensor, end: Tensor, clusters: int, rounds: int = 20)
     centres = points[farthest_points(points[:, :3], clusters)]
     for _ in range(rounds):
         nearest = torch.cdist(points, centres).argmin(1)
-        centres = torch.stack([points[nearest == k].mean(0) if bool((nearest == k).any()) else centres[k] for k in range(clusters)])
+        centres = torch.stack(
+            [points[nearest == k].mean(0) if bool((nearest == k).any()) else centres[k] for k in range(clusters)]
+        )
     labels[index] = nearest + 1
     return labels

@@ -14,8 +14,8 @@ Limit = tuple[Tensor, Tensor, Tensor, float]  # seen_from, rotations, eye, least
 def part_pulls(means: Tensor, quats: Tensor, parts: Parts, centres: Tensor, limit: Limit | None = None) -> Tensor:
     """Gradient [K-1, 6] (by rotation about the part's centre, by translation), float64 on the CPU.
 
-    means [N, 3] and quats [N, 4], moved, with their ``grad``.  centres [K-1, 3].  limit: (seen_from [N, 3], rotations [K-1, 3, 3], eye [3],
-    least cosine): Gaussians that look at ``eye`` with a smaller cosine (``facing``) have no say.
+    means [N, 3] and quats [N, 4], moved, with their ``grad``.  centres [K-1, 3].  limit: (seen_from [N, 3], rotations
+    [K-1, 3, 3], eye [3], least cosine): Gaussians that look at ``eye`` with a smaller cosine (``facing``) have no say.
     float32 on the CPU takes native code, anything else ``part_pulls_reference``.
     """
     assert means.grad is not None and quats.grad is not None
@@ -29,27 +29,36 @@ def part_pulls(means: Tensor, quats: Tensor, parts: Parts, centres: Tensor, limi
     out = centres.new_zeros(len(centres), 6)
     addresses = [t.data_ptr() for t in kept] + [0] * (7 - len(kept))
     rows, starts = parts.rows.data_ptr(), parts.starts.data_ptr()
-    native.part_pulls(addresses, centres.data_ptr(), rows, starts, parts.count, limit[3] if limit else -1.0, out.data_ptr())
+    native.part_pulls(
+        addresses, centres.data_ptr(), rows, starts, parts.count, limit[3] if limit else -1.0, out.data_ptr()
+    )
     return out
 
 
-def part_pulls_reference(means: Tensor, quats: Tensor, parts: Parts, centres: Tensor, limit: Limit | None = None) -> Tensor:
+def part_pulls_reference(
+    means: Tensor, quats: Tensor, parts: Parts, centres: Tensor, limit: Limit | None = None
+) -> Tensor:
     """``part_pulls`` in torch, on any device."""
     rows, part = parts.rows, parts.labels[parts.rows] - 1
     assert means.grad is not None and quats.grad is not None
     at, turned = means.detach()[rows], quats.detach()[rows]
-    pulls = torch.cat(tangent_gradient(at, turned, means.grad[rows], quats.grad[rows], centres.double().to(means.device)[part]), 1)
+    pulls = torch.cat(
+        tangent_gradient(at, turned, means.grad[rows], quats.grad[rows], centres.double().to(means.device)[part]), 1
+    )
     if limit:
         seen_from, turns, eye, least = limit
         pulls = pulls * (facing(seen_from[rows], turns.to(means)[part], at, eye) >= least)[:, None]
     return pulls.new_zeros(len(centres), 6).index_add_(0, part, pulls).cpu()
 
 
-def tangent_gradient(means: Tensor, quats: Tensor, grad_means: Tensor, grad_quats: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Each point's share of the gradient of a loss by a small rotation about ``centre`` and a small translation of points already moved.
+def tangent_gradient(
+    means: Tensor, quats: Tensor, grad_means: Tensor, grad_quats: Tensor, centre: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Each point's share of the gradient of a loss by a small rotation about ``centre`` and a small translation of
+    points already moved.
 
-    means, grad_means [n, 3]; quats, grad_quats [n, 4]; centre [3] or [n, 3].  Returns (rotation [n, 3], translation [n, 3]), float64: their
-    sums are the gradient. A rotation by w turns a quaternion q into q + 0.5 (0, w) q.
+    means, grad_means [n, 3]; quats, grad_quats [n, 4]; centre [3] or [n, 3].  Returns (rotation [n, 3], translation [n,
+    3]), float64: their sums are the gradient. A rotation by w turns a quaternion q into q + 0.5 (0, w) q.
     """
     grad_means, grad_quats = grad_means.double(), grad_quats.double()
     rotation = torch.linalg.cross(means.double() - centre, grad_means)
@@ -60,10 +69,11 @@ def tangent_gradient(means: Tensor, quats: Tensor, grad_means: Tensor, grad_quat
 
 
 def facing(seen_from: Tensor, rotation: Tensor, means: Tensor, eye: Tensor) -> Tensor:
-    """Cosine [n] between the direction from moved points ``means`` [n, 3] to ``eye`` [3] and their ``seen_from`` [n, 3], turned by
-    ``rotation`` [3, 3] or [n, 3, 3].
+    """Cosine [n] between the direction from moved points ``means`` [n, 3] to ``eye`` [3] and their ``seen_from`` [n,
+    3], turned by ``rotation`` [3, 3] or [n, 3, 3].
 
-    The back of a door's front face, seen through an opened door, stands a door's thickness before the inner face in the photograph.
+    The back of a door's front face, seen through an opened door, stands a door's thickness before the inner face in the
+    photograph.
     """
     way = torch.nn.functional.normalize(eye.to(means) - means, dim=1)
     return ((rotation.to(means) @ seen_from[..., None])[..., 0] * way).sum(1)

@@ -1,6 +1,7 @@
 """One rigid motion between two states: each state's Gaussians, frozen, in the other's photographs of what did not move.
 
-Where a state's Gaussians and the other's, drawn from one camera, lie at one depth, nothing moved; only there the pictures are compared.
+Where a state's Gaussians and the other's, drawn from one camera, lie at one depth, nothing moved; only there the
+pictures are compared.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from torch import Tensor
 
 from p2gs.data.views import TargetImage, TrainingViews
 from p2gs.gaussians.draw import render_gaussians
-from p2gs.models.phase import exponential
 from p2gs.ops import se3
+from p2gs.ops.decay import exponential
 from p2gs.ops.ssim import l1_ssim
 from p2gs.types import Camera, GaussianTensors, RenderOutput
 
@@ -25,8 +26,8 @@ EDGE = 2  # pixels beside what moved that are left out with it: the blur of Gaus
 
 @dataclass
 class PhotoSide:
-    """One state's Gaussians, and the other state's with its photographs.  back: the Gaussians are the start's, so that the end's cameras
-    go to them by the inverse of the motion end -> start."""
+    """One state's Gaussians, and the other state's with its photographs.  back: the Gaussians are the start's, so that
+    the end's cameras go to them by the inverse of the motion end -> start."""
 
     gaussians: GaussianTensors
     other: GaussianTensors
@@ -40,7 +41,9 @@ class PhotoSide:
     def draw(self, camera: Camera, transform: Tensor, backend: str) -> RenderOutput:
         """The Gaussians as the photograph's camera sees them, before grey; differentiable by ``transform``."""
         seen = _at(camera, self.viewmat(camera, transform).to(camera.viewmat))
-        return render_gaussians(self.gaussians, seen, torch.full((3,), GREY, device=camera.viewmat.device), backend=backend)
+        return render_gaussians(
+            self.gaussians, seen, torch.full((3,), GREY, device=camera.viewmat.device), backend=backend
+        )
 
 
 def unmoved(side: PhotoSide, camera: Camera, transform: Tensor, tolerance: float, backend: str) -> Tensor:
@@ -64,10 +67,12 @@ def fit_photographs(
     rate: float = 1e-3,
     backend: str = "auto",
 ) -> Tensor:
-    """The motion end -> start [4, 4] float64, refined from ``transform``; coordinates are internal (the object is 2 in diagonal).
+    """The motion end -> start [4, 4] float64, refined from ``transform``; coordinates are internal (the object is 2 in
+    diagonal).
 
-    picks: which photographs of each side.  steps: per side, with Adam on one twist about the origin, the box's centre; rate: of the first,
-    in internal units, falling to a hundredth.  size: of the pictures, one of the views' levels.  tolerance: as in ``unmoved``.
+    picks: which photographs of each side.  steps: per side, with Adam on one twist about the origin, the box's centre;
+    rate: of the first, in internal units, falling to a hundredth.  size: of the pictures, one of the views' levels.
+    tolerance: as in ``unmoved``.
     """
     transform = transform.double().clone()
     first, second = torch.zeros(6).double(), torch.zeros(6).double()
@@ -96,7 +101,9 @@ def photograph(views: TrainingViews, index: int, size: int, device) -> TargetIma
     return TargetImage(shot.image.to(device), shot.alpha.to(device), None, shot.key, shot.camera.to(device))
 
 
-def compare(side: PhotoSide, shot: TargetImage, weight: Tensor, transform: Tensor, backend: str, ssim_lambda: float = STRUCTURE) -> Tensor:
+def compare(
+    side: PhotoSide, shot: TargetImage, weight: Tensor, transform: Tensor, backend: str, ssim_lambda: float = STRUCTURE
+) -> Tensor:
     """Image loss where ``weight`` [H, W] is 1; a scalar, differentiable by ``transform``."""
     colour = shot.image + weight[..., None] * (side.draw(shot.camera, transform, backend).colour - shot.image)
     # per compared pixel: a photograph of which little can be compared counts as much as another

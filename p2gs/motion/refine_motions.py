@@ -1,4 +1,5 @@
-"""Part motions against the photographs: which Gaussians have a say, refinement of all motions at once, what an explanation costs."""
+"""Part motions against the photographs: which Gaussians have a say, refinement of all motions at once, what an
+explanation costs."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ from p2gs.motion.screw_polish import PolishConfig, Side, allowed_step, apply_ste
 from p2gs.ops import se3
 from p2gs.visibility.depth_stack import DepthStack
 
-# What a pixel costs that the other state hides: as much of the loss of one without any likeness (1 of 1 - SSIM, weighted 0.8) as landing in
-# hidden space costs of landing in free space.
+# What a pixel costs that the other state hides: as much of the loss of one without any likeness (1 of 1 - SSIM,
+# weighted 0.8) as landing in hidden space costs of landing in free space.
 HIDDEN = 0.8 * Landing.HIDDEN
 KNOWN = 64  # answers of a ``Judge`` that are kept
 
@@ -32,7 +33,8 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
 def sides_of(
     states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], *, backend: str, device="cpu"
 ) -> list[Side]:
-    """Both directions: the start's Gaussians against the end's photographs, and the reverse, of each what both states show.
+    """Both directions: the start's Gaussians against the end's photographs, and the reverse, of each what both states
+    show.
 
     stacks: rendered depth of both states.
     """
@@ -41,13 +43,23 @@ def sides_of(
     for s in (0, 1):
         g = states[s].gaussians
         labels = torch.where(seen[s].kept, polish_labels(motions, s, config.min_margin), -1)
-        seen_from = stacks[s].seen_from(g.means.detach().cpu(), config.free_static or 0.02) if config.front > -1 else None
+        seen_from = (
+            stacks[s].seen_from(g.means.detach().cpu(), config.free_static or 0.02) if config.front > -1 else None
+        )
         sides.append(Side(g, labels, views[1 - s], s == 1, seen_from, seen[1 - s].pixels))
     return sides
 
 
 def refine(
-    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], *, seed: int, backend: str, device="cpu"
+    states,
+    motions: PartMotions,
+    views,
+    config: PolishConfig,
+    stacks: list[DepthStack],
+    *,
+    seed: int,
+    backend: str,
+    device="cpu",
 ) -> PartMotions:
     """Photometric refinement of all motions, both directions at once."""
     if config.steps <= 0 or len(motions) == 0:
@@ -58,7 +70,15 @@ def refine(
 
 
 def single_ways(
-    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], *, seed: int, backend: str, device="cpu"
+    states,
+    motions: PartMotions,
+    views,
+    config: PolishConfig,
+    stacks: list[DepthStack],
+    *,
+    seed: int,
+    backend: str,
+    device="cpu",
 ) -> dict:
     """Where each direction alone takes refined motions: {"forward", "backward"} [K-1, 4, 4], both start -> end.
 
@@ -68,7 +88,10 @@ def single_ways(
         return {}
     short = replace(config, steps=max(config.steps // 3, 1), rate=config.rate / 2)
     sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
-    found = [polish([side], motions.transforms, motions.types, short, seed=seed, backend=backend, device=device) for side in sides]
+    found = [
+        polish([side], motions.transforms, motions.types, short, seed=seed, backend=backend, device=device)
+        for side in sides
+    ]
     return {name: T for name, (T, _) in zip(("forward", "backward"), found, strict=True)}
 
 
@@ -78,12 +101,17 @@ def explanation_cost(
 ) -> float:  # fmt: skip
     """Image loss of each state's Gaussians moved into the other state's photographs, both directions averaged.
 
-    Of the Gaussians those that nothing contradicts are drawn (``kept_and_shown``); pixels of surface that the other state hides cost ``HIDDEN``
-    instead of what is wrong in them, which no motion could mend.  level: size of the photographs (None: ``config``'s last).  seen: what is
-    drawn and what counts, of ``what_counts`` (None: found for these motions).
+    Of the Gaussians those that nothing contradicts are drawn (``kept_and_shown``); pixels of surface that the other
+    state hides cost ``HIDDEN`` instead of what is wrong in them, which no motion could mend.  level: size of the
+    photographs (None: ``config``'s last).  seen: what is drawn and what counts, of ``what_counts`` (None: found for
+    these motions).
     """
     seen = what_counts(states, motions, config, stacks, backend=backend, device=device) if seen is None else seen
-    ways, level, total = (motions.transforms, se3.inverse(motions.transforms)), config.levels[-1] if level is None else level, 0.0
+    ways, level, total = (
+        (motions.transforms, se3.inverse(motions.transforms)),
+        config.levels[-1] if level is None else level,
+        0.0,
+    )
     for s in (0, 1):
         labels, options = torch.where(seen[s].kept, motions.labels[s], -1), {"backend": backend, "device": device}
         there = {"level": level, "shown": seen[1 - s].pixels, "hidden": HIDDEN}
@@ -93,12 +121,12 @@ def explanation_cost(
 
 @dataclass
 class Judge:
-    """By what explanations are compared and refined: one number, the logarithm of the image loss (``explanation_cost``) plus what the surfaces
-    say (``surface_energy``); lower is better. Adding 0.01 is an image loss higher by a hundredth, or a hundredth of the moved surface left
-    unexplained.
+    """By what explanations are compared and refined: one number, the logarithm of the image loss (``explanation_cost``)
+    plus what the surfaces say (``surface_energy``); lower is better. Adding 0.01 is an image loss higher by a
+    hundredth, or a hundredth of the moved surface left unexplained.
 
-    found: discovery's problem (None: photographs alone).  stacks: rendered depth of both states.  further: share of the image loss that a
-    further part must save.
+    found: discovery's problem (None: photographs alone).  stacks: rendered depth of both states.  further: share of the
+    image loss that a further part must save.
     """
 
     found: Discovery | None
@@ -110,7 +138,8 @@ class Judge:
     backend: str
     device: torch.device | str = "cpu"
     further: float = 0.0
-    known: list[tuple] = field(default_factory=list, init=False)  # the latest motions, what was asked of them, the answer
+    # the latest motions, what was asked of them, the answer
+    known: list[tuple] = field(default_factory=list, init=False)
 
     def _asked(self, motions: PartMotions, what: str, answer: Callable[[], float]) -> float:
         """``answer()``, or what it was the last time for the same motions."""
@@ -122,7 +151,9 @@ class Judge:
 
     def at_a_glance(self, steps: int) -> Judge:
         """The same by the smallest photographs, refining in fewer steps."""
-        return replace(self, config=replace(self.config, steps=steps, levels=self.config.levels[:1], level_starts=[0.0]))
+        return replace(
+            self, config=replace(self.config, steps=steps, levels=self.config.levels[:1], level_starts=[0.0])
+        )
 
     def cost(self, motions: PartMotions) -> float:
         """Image loss (``explanation_cost``)."""
@@ -147,15 +178,16 @@ class Judge:
         return refine(self.states, motions, self.views, self.config, self.stacks, **options)
 
     def improved(self, motions: PartMotions) -> tuple[float, float, PartMotions]:
-        """Energy, image loss and motions: refined where that lowers the energy, else as they were. Where a part is plain, photographs
-        alone let it drift along itself, and surfaces know better."""
+        """Energy, image loss and motions: refined where that lowers the energy, else as they were. Where a part is
+        plain, photographs alone let it drift along itself, and surfaces know better."""
         tried = self.refine(motions)
         return min(((*self(m), m) for m in (motions, tried)), key=lambda t: t[0])
 
 
 @dataclass
 class Seen:
-    """Of a state: which Gaussians [N] nothing contradicts in the other state; the weight of its photographs' pixels (None: all count alike)."""
+    """Of a state: which Gaussians [N] nothing contradicts in the other state; the weight of its photographs' pixels
+    (None: all count alike)."""
 
     kept: Tensor
     pixels: ShownPixels | None
@@ -164,8 +196,8 @@ class Seen:
 def what_counts(
     states, motions: PartMotions, config: PolishConfig, stacks: list[DepthStack], *, backend: str, device="cpu"
 ) -> list[Seen]:
-    """Of both states, under these motions. Pixels count as far as they are not of surface that the other state hides; everything does where
-    a tolerance of ``config`` is 0."""
+    """Of both states, under these motions. Pixels count as far as they are not of surface that the other state hides;
+    everything does where a tolerance of ``config`` is 0."""
     out = []
     for s in (0, 1):
         if config.free_static <= 0 or config.free_moving <= 0:
@@ -177,13 +209,22 @@ def what_counts(
 
 
 def survey(
-    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], reach: list[float], *, backend: str, device="cpu"
+    states,
+    motions: PartMotions,
+    views,
+    config: PolishConfig,
+    stacks: list[DepthStack],
+    reach: list[float],
+    *,
+    backend: str,
+    device="cpu",
 ) -> tuple[PartMotions, list[int]]:
-    """Lay each part, shifted within its own surface, where the images are explained best; the refinement goes on from there.
+    """Lay each part, shifted within its own surface, where the images are explained best; the refinement goes on from
+    there.
 
-    A plain door shifted along itself still covers most of its place: a minimum of its own, centimetres from the true one, that no
-    descent leaves. reach: shifts tried to both sides of the part's two long directions (internal units).  Returns the motions
-    and which of them moved.
+    A plain door shifted along itself still covers most of its place: a minimum of its own, centimetres from the true
+    one, that no descent leaves. reach: shifts tried to both sides of the part's two long directions (internal units).
+    Returns the motions and which of them moved.
     """
     seen = what_counts(states, motions, config, stacks, backend=backend, device=device)
     options = {"level": config.levels[0], "seen": seen, "backend": backend, "device": device}
@@ -200,7 +241,9 @@ def survey(
         for way in torch.linalg.svd(at - centre, full_matrices=False)[2][:2]:
             for size in [sign * r for r in reach for sign in (1, -1)]:
                 shift = torch.cat([torch.zeros(3, dtype=torch.float64), way * size])
-                step = allowed_step([motions.types[k]], motions.transforms[k : k + 1], centre[None], torch.tensor([radius]), shift[None])[0]
+                step = allowed_step(
+                    [motions.types[k]], motions.transforms[k : k + 1], centre[None], torch.tensor([radius]), shift[None]
+                )[0]
                 if float(step[3:].norm()) < 0.5 * abs(size):
                     continue
                 T = apply_step(motions.transforms[k], centre, radius, step)

@@ -1,7 +1,7 @@
 """Refine rigid part motions by rendering: frozen Gaussians of one state, moved, against the other state's photographs.
 
-Optimising screws and Gaussians together drags the screws (wrongly labelled Gaussians follow); with Gaussians frozen the same
-images give the motion to a few hundredths of a degree.
+Optimising screws and Gaussians together drags the screws (wrongly labelled Gaussians follow); with Gaussians frozen the
+same images give the motion to a few hundredths of a degree.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
-from p2gs.models.phase import exponential
 from p2gs.motion.part_pull import part_pulls
 from p2gs.ops import se3, so3
 from p2gs.ops.carry import Parts, carry
+from p2gs.ops.decay import exponential
 from p2gs.ops.ssim import l1_ssim
 from p2gs.render import rasterize
 from p2gs.types import Camera, GaussianTensors
@@ -26,13 +26,14 @@ from p2gs.types import Camera, GaussianTensors
 class PolishConfig:
     """Options of the photometric screw refinement.
 
-    steps: per direction (0 = off).  levels, level_starts: image sizes over the steps.  rate: step size at the start in internal
-    units of displacement at the part's rim; falls to a hundredth.  ssim_lambda: weight of SSIM against L1; high, because shading
-    differs between states while structure does not.  min_margin: Gaussians whose label is less clear than this (internal units)
-    are left out.  free_static, free_moving: tolerances (internal units) for what of the base and of moving parts lies
-    on a surface of the other state; other_colour: mean difference of channels (0..1) by which it is another's surface. Only what both
-    states show has a say (``motion/agreement.py``; free_static or free_moving 0: all has).  front: a view has no say on a surface that its
-    own state's cameras saw from directions whose cosine with the view's is below this (-1: all views have).
+    steps: per direction (0 = off).  levels, level_starts: image sizes over the steps.  rate: step size at the start in
+    internal units of displacement at the part's rim; falls to a hundredth.  ssim_lambda: weight of SSIM against L1;
+    high, because shading differs between states while structure does not.  min_margin: Gaussians whose label is less
+    clear than this (internal units) are left out.  free_static, free_moving: tolerances (internal units) for what of
+    the base and of moving parts lies on a surface of the other state; other_colour: mean difference of channels (0..1)
+    by which it is another's surface. Only what both states show has a say (``motion/agreement.py``; free_static or
+    free_moving 0: all has).  front: a view has no say on a surface that its own state's cameras saw from directions
+    whose cosine with the view's is below this (-1: all views have).
     """
 
     steps: int = 200
@@ -76,7 +77,9 @@ class MovedGaussians:
         """Means [N, 3], quats [N, 4] and SH [N, B, 3] after the motions; transforms [K-1, 4, 4]."""
         return carry(self.g.means, self.quats, self.g.sh, self.bodies, transforms)
 
-    def render(self, means: Tensor, quats: Tensor, sh: Tensor, camera: Camera, background: Tensor, backend: str, features=None):
+    def render(
+        self, means: Tensor, quats: Tensor, sh: Tensor, camera: Camera, background: Tensor, backend: str, features=None
+    ):
         """A view of what ``moved`` gives, or of the like; features [N, F] as in ``rasterize``."""
         camera, background = camera.to(self.device), background.to(self.device)
         return rasterize(
@@ -96,10 +99,11 @@ class MovedGaussians:
 
 
 def allowed_step(kinds: list[str], T: Tensor, centre: Tensor, radius: Tensor, step: Tensor) -> Tensor:
-    """Project tangent steps [K, 6] = (rotation * radius, translation) at ``centre`` [K, 3] onto the motions of the joints' types.
+    """Project tangent steps [K, 6] = (rotation * radius, translation) at ``centre`` [K, 3] onto the motions of the
+    joints' types.
 
-    T [K, 4, 4], radius [K].  Prismatic: no rotation. Revolute: the pitch (translation along the axis) must stay zero, one linear condition;
-    a Newton correction removes what pitch there is. Free: as it is.
+    T [K, 4, 4], radius [K].  Prismatic: no rotation. Revolute: the pitch (translation along the axis) must stay zero,
+    one linear condition; a Newton correction removes what pitch there is. Free: as it is.
     """
     rotvec = so3.matrix_to_rotvec(T[:, :3, :3])
     angle = rotvec.norm(dim=1, keepdim=True).clamp_min(1e-3)
@@ -109,7 +113,9 @@ def allowed_step(kinds: list[str], T: Tensor, centre: Tensor, radius: Tensor, st
     # the axis turns by the inverse left Jacobian of the rotation vector (Sola et al. 2018, arXiv:1812.01537, Eq. 146)
     tilt = across / (2 * torch.tan(angle / 2)) + torch.linalg.cross(axis, across) / 2
     normal = torch.cat([(torch.linalg.cross(t - centre, axis) + tilt) / radius[:, None], axis], 1)
-    turned = step - normal * (((normal * step).sum(1, keepdim=True) + pitch) / (normal * normal).sum(1, keepdim=True).clamp_min(1e-12))
+    turned = step - normal * (
+        ((normal * step).sum(1, keepdim=True) + pitch) / (normal * normal).sum(1, keepdim=True).clamp_min(1e-12)
+    )
     slid = torch.cat([torch.zeros_like(step[:, :3]), step[:, 3:]], 1)
     by_type = {"revolute": turned, "prismatic": slid, "free": step}
     return torch.stack([by_type[kind][k] for k, kind in enumerate(kinds)]) if kinds else step
@@ -125,9 +131,9 @@ def apply_step(T: Tensor, centre: Tensor, radius: Tensor | float, step: Tensor) 
 class Side:
     """Frozen Gaussians of one state, labels [N] (part of each, -1 leaves it out) and the other state's photographs.
 
-    back: they are the end state's, carried to the start.  seen_from: mean direction [N, 3] to the cameras of their own state that see
-    each (``DepthStack.seen_from``); None: all views count.  shown: weight [H, W] of the pixels of a photograph, asked with its number, size
-    and camera (``ShownPixels``); None: all count alike.
+    back: they are the end state's, carried to the start.  seen_from: mean direction [N, 3] to the cameras of their own
+    state that see each (``DepthStack.seen_from``); None: all views count.  shown: weight [H, W] of the pixels of a
+    photograph, asked with its number, size and camera (``ShownPixels``); None: all count alike.
     """
 
     gaussians: GaussianTensors
@@ -148,11 +154,12 @@ def polish(
     backend: str = "auto",
     device: torch.device | str = "cpu",
 ) -> tuple[Tensor, list[float]]:
-    """Refine ``transforms`` [K-1, 4, 4] (start -> end) so that the moved Gaussians match the photographs of all sides at once.
+    """Refine ``transforms`` [K-1, 4, 4] (start -> end) so that the moved Gaussians match the photographs of all sides
+    at once.
 
-    Steps look at the sides in turn and share one descent: where one state's surfaces are wrong its own optimum is wrong too, and a mean
-    of two optima with it; the sum of both losses has its minimum near the truth. A backward step of B = T^-1 about a point a is
-    the forward one about T a with its vectors turned by -R.
+    Steps look at the sides in turn and share one descent: where one state's surfaces are wrong its own optimum is wrong
+    too, and a mean of two optima with it; the sum of both losses has its minimum near the truth. A backward step of B =
+    T^-1 about a point a is the forward one about T a with its vectors turned by -R.
     types: "revolute" | "prismatic" | "free" per movable part. ``config.steps`` are taken per side.
     Returns (transforms float64, each side's mean loss over the last tenth).
     """
@@ -194,7 +201,11 @@ def polish(
             losses[turn].append(float(loss.detach()))
         centre = se3.apply(transforms, anchors[:, None])[:, 0]
         back = transforms[:, :3, :3].transpose(1, 2) if side.back else transforms[:, :3, :3]
-        limit = (fronts[turn], back, shot.camera.position, config.front) if fronts[turn] is not None and config.front > -1 else None
+        limit = (
+            (fronts[turn], back, shot.camera.position, config.front)
+            if fronts[turn] is not None and config.front > -1
+            else None
+        )
         gradient = part_pulls(means, quats, body.bodies, anchors if side.back else centre, limit)
         if side.back:
             gradient = -torch.cat([(transforms[:, :3, :3] @ g[..., None])[..., 0] for g in gradient.split(3, 1)], 1)
@@ -216,7 +227,8 @@ def polish(
 
 
 def _anchors(sides, bodies, transforms: Tensor) -> tuple[Tensor, Tensor]:
-    """Each part's centre at the start [K-1, 3] and the spread of its points [K-1] (float64, CPU), means over the sides."""
+    """Each part's centre at the start [K-1, 3] and the spread of its points [K-1] (float64, CPU), means over the
+    sides."""
     anchors, radius = [], []
     for k in range(len(transforms)):
         centres, spreads = [], []
@@ -247,9 +259,11 @@ def photometric_cost(
     backend: str = "auto",
     device: torch.device | str = "cpu",
 ) -> float:
-    """Mean image loss of the moved Gaussians over ``count`` views spread over the training set: lower explains the images better.
+    """Mean image loss of the moved Gaussians over ``count`` views spread over the training set: lower explains the
+    images better.
 
-    shown: weight of each pixel, as in ``Side``; what a pixel lacks of 1 costs ``hidden`` instead (None: all count alike).
+    shown: weight of each pixel, as in ``Side``; what a pixel lacks of 1 costs ``hidden`` instead (None: all count
+    alike).
     """
     body = MovedGaussians(gaussians, labels, device)
     means, quats, sh = body.moved(transforms)
@@ -258,7 +272,10 @@ def photometric_cost(
         background = torch.full((3,), 0.5)
         size = views.levels.index(level)
         shot = views.get(index, size, background)
-        colour, target = body.render(means, quats, sh, shot.camera, background, backend).colour, shot.image.to(body.device)
+        colour, target = (
+            body.render(means, quats, sh, shot.camera, background, backend).colour,
+            shot.image.to(body.device),
+        )
         if shown is not None:
             weight = shown(index, size, shot.camera)
             colour = target + weight[..., None] * (colour - target)

@@ -30,7 +30,8 @@ class PartScrews(nn.Module):
 
 
 def initial_screws(kind: str, parts: int, generator: torch.Generator) -> Tensor:
-    """Start transforms [K-1, 4, 4]: "identity" (with noise of 0.01) or "random" (paper section 4.3: rotations at random)."""
+    """Start transforms [K-1, 4, 4]: "identity" (with noise of 0.01) or "random" (paper section 4.3: rotations at
+    random)."""
     noise = torch.randn(parts - 1, 6, generator=generator)
     if kind == "identity":
         return se3.exp(1e-2 * noise)
@@ -41,6 +42,7 @@ def initial_screws(kind: str, parts: int, generator: torch.Generator) -> Tensor:
 
 
 def blend_move(g: GaussianTensors, probs: Tensor, twists: Tensor) -> GaussianTensors:
-    """The Gaussians where their soft assignment probs [N, K] puts them under the motions of twists [K-1, 6]; see ``ops.blend``."""
+    """The Gaussians where their soft assignment probs [N, K] puts them under the motions of twists [K-1, 6]; see
+    ``ops.blend``."""
     means, quats = blend.blend_move(g.means, g.quats, probs, twists)
     return g.placed(means, quats)

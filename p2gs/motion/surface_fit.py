@@ -1,9 +1,10 @@
 """One small rigid motion that brings two states' surfaces to agree wherever nothing moved.
 
-What moved between the states does not agree under the base's motion, so the fit must not listen to it: iterated closest points, point to
-plane (Chen and Medioni 1992, doi:10.1016/0262-8856(92)90066-C), from the identity, with Geman and McClure's weights, whose scale falls
-from the reach of the search to the noise of the surfaces (Zhou et al. 2016, doi:10.1007/978-3-319-46475-6_47). Surfels are spread evenly
-over the surfaces, so what it ends at is the motion with the widest support near the identity, not the one with the most texture.
+What moved between the states does not agree under the base's motion, so the fit must not listen to it: iterated closest
+points, point to plane (Chen and Medioni 1992, doi:10.1016/0262-8856(92)90066-C), from the identity, with Geman and
+McClure's weights, whose scale falls from the reach of the search to the noise of the surfaces (Zhou et al. 2016,
+doi:10.1007/978-3-319-46475-6_47). Surfels are spread evenly over the surfaces, so what it ends at is the motion with
+the widest support near the identity, not the one with the most texture.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ WITHIN = 3.0  # standard deviations of the surfels' noise: an agreeing point's d
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """transform [4, 4] float64.  share: of the moved surfels that agree with the other surface.  spread: least standard deviation of
-    those points over all directions.  rms: of their distances from it.  Lengths are the surfels'."""
+    """transform [4, 4] float64.  share: of the moved surfels that agree with the other surface.  spread: least standard
+    deviation of those points over all directions.  rms: of their distances from it.  Lengths are the surfels'."""
 
     transform: Tensor
     share: float
@@ -36,8 +37,8 @@ class SurfaceFit:
 def fit_surfaces(source: Surfels, target: Surfels, reach: float, rounds: int = 40, most: int = 8000) -> SurfaceFit:
     """The motion that carries ``source`` onto ``target`` where both show the same surface.
 
-    reach: scale of the weights in the first round, the distance up to which surfaces are looked for (scene units).  most: so many of the
-    source's surfels, evenly picked, are looked at.
+    reach: scale of the weights in the first round, the distance up to which surfaces are looked for (scene units).
+    most: so many of the source's surfels, evenly picked, are looked at.
     """
     pick = torch.linspace(0, len(source) - 1, min(len(source), most)).round().long()
     points, normals = source.points[pick].double(), source.normals[pick].double()
@@ -47,7 +48,8 @@ def fit_surfaces(source: Surfels, target: Surfels, reach: float, rounds: int = 4
     spacing = max(source.spacing, target.spacing)
     T = torch.eye(4, dtype=torch.float64)
     for i in range(rounds):
-        scale = max(reach * (noise / reach) ** min(1.5 * i / max(rounds - 1, 1), 1.0), noise)  # a third of the rounds at the noise
+        # a third of the rounds at the noise
+        scale = max(reach * (noise / reach) ** min(1.5 * i / max(rounds - 1, 1), 1.0), noise)
         p, j, r, ok = _pairs(T, points, normals, tree, onto, facing, max(ALONG * spacing, scale))
         if int(ok.sum()) < 6:
             break
@@ -66,7 +68,8 @@ def fit_surfaces(source: Surfels, target: Surfels, reach: float, rounds: int = 4
 
 
 def _pairs(T: Tensor, points: Tensor, normals: Tensor, tree, onto: Tensor, facing: Tensor, along: float):
-    """Moved points [N, 3], the surfel nearest to each [N], the distance from its plane [N], and whether both are of one surface [N]."""
+    """Moved points [N, 3], the surfel nearest to each [N], the distance from its plane [N], and whether both are of one
+    surface [N]."""
     p, n = se3.apply(T, points), normals @ T[:3, :3].T
     j = torch.from_numpy(tree.query(p.numpy())[1])
     d = p - onto[j]

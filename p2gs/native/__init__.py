@@ -36,7 +36,8 @@ _kernel_threads: Optional[int] = None  # inside serial_torch: what torch had
 
 
 def num_threads() -> int:
-    """Threads a kernel may use: those of torch (``torch.set_num_threads``, ``OMP_NUM_THREADS``), inside ``serial_torch`` those it had."""
+    """Threads a kernel may use: those of torch (``torch.set_num_threads``, ``OMP_NUM_THREADS``), inside
+    ``serial_torch`` those it had."""
     import torch
 
     return _kernel_threads or torch.get_num_threads()
@@ -44,10 +45,11 @@ def num_threads() -> int:
 
 @contextmanager
 def serial_torch(on: bool = True) -> Iterator[None]:
-    """Inside, torch's own operations stay on one thread and the kernels keep all of them; ``on=False``: nothing changes.
+    """Inside, torch's own operations stay on one thread and the kernels keep all of them; ``on=False``: nothing
+    changes.
 
-    What a training step leaves to torch are many operations on some ten thousand numbers. Sharing each out wakes a sleeping thread, which
-    takes longer than the work, and the two pools fight for the same cores.
+    What a training step leaves to torch are many operations on some ten thousand numbers. Sharing each out wakes a
+    sleeping thread, which takes longer than the work, and the two pools fight for the same cores.
     """
     import torch
 
@@ -66,7 +68,8 @@ def serial_torch(on: bool = True) -> Iterator[None]:
 
 
 def keep_memory() -> None:
-    """For a process that trains: malloc keeps what a step frees for the next one (up to 1 GiB), which saves the page faults.
+    """For a process that trains: malloc keeps what a step frees for the next one (up to 1 GiB), which saves the page
+    faults.
 
     For the whole process, and for good; only with glibc. Importing p2gs does not do it, ``p2gs fit`` does.
     """

@@ -1,4 +1,5 @@
-"""Soft part assignment, softmax of a linear classifier over embeddings (paper section 4.2): a native kernel, and the same in torch."""
+"""Soft part assignment, softmax of a linear classifier over embeddings (paper section 4.2): a native kernel, and the
+same in torch."""
 
 from __future__ import annotations
 
@@ -11,9 +12,9 @@ from p2gs.native import native, num_threads
 def soft_assignment(psi: Tensor, weight: Tensor, bias: Tensor, temperature: float = 1.0) -> Tensor:
     """softmax((psi weight^T + bias) / temperature) over the parts: psi [N, D], weight [K, D], bias [K] -> [N, K].
 
-    The result lies part by part in memory: K is small, and whoever reads it goes along the Gaussians. Differentiable by all three.
-    float32 on the CPU with K <= 32 and D <= 64 takes the native kernel (the same bits for any number of threads), anything else
-    ``soft_assignment_reference``. Raises ValueError for shapes that do not fit.
+    The result lies part by part in memory: K is small, and whoever reads it goes along the Gaussians. Differentiable by
+    all three. float32 on the CPU with K <= 32 and D <= 64 takes the native kernel (the same bits for any number of
+    threads), anything else ``soft_assignment_reference``. Raises ValueError for shapes that do not fit.
     """
     parts, dim = weight.shape
     if psi.ndim != 2 or psi.shape[1] != dim or bias.shape != (parts,):

@@ -1,4 +1,5 @@
-"""Gaussians moved by softly assigned rigid motions (paper appendix, part assignment): a native kernel, and the same in torch."""
+"""Gaussians moved by softly assigned rigid motions (paper appendix, part assignment): a native kernel, and the same in
+torch."""
 
 from __future__ import annotations
 
@@ -10,12 +11,14 @@ from p2gs.ops import se3, so3
 
 
 def blend_move(means: Tensor, quats: Tensor, probs: Tensor, twists: Tensor) -> tuple[Tensor, Tensor]:
-    """mu' = sum_k p_k (R_k mu + t_k), and the Gaussians' rotations turned by the p-weighted mean of the parts' quaternions.
+    """mu' = sum_k p_k (R_k mu + t_k), and the Gaussians' rotations turned by the p-weighted mean of the parts'
+    quaternions.
 
-    means [N, 3]; quats [N, 4] wxyz of any length; probs [N, K]; twists [K-1, 6]: motion k is exp(twists[k-1]), slot 0 stands still.
-    Returns (means [N, 3], unit quats [N, 4]). The parts' quaternions are taken on slot 0's side (w >= 0) before they are averaged; a
-    mean of no length is the identity. Differentiable by all four. float32 on the CPU takes the native kernel (the same bits for any
-    number of threads), anything else ``blend_move_reference``. Raises ValueError for shapes that do not fit.
+    means [N, 3]; quats [N, 4] wxyz of any length; probs [N, K]; twists [K-1, 6]: motion k is exp(twists[k-1]), slot 0
+    stands still. Returns (means [N, 3], unit quats [N, 4]). The parts' quaternions are taken on slot 0's side (w >= 0)
+    before they are averaged; a mean of no length is the identity. Differentiable by all four. float32 on the CPU takes
+    the native kernel (the same bits for any number of threads), anything else ``blend_move_reference``. Raises
+    ValueError for shapes that do not fit.
     """
     n, parts = probs.shape
     if means.shape != (n, 3) or quats.shape != (n, 4) or twists.shape != (parts - 1, 6):
@@ -31,7 +34,8 @@ def blend_move(means: Tensor, quats: Tensor, probs: Tensor, twists: Tensor) -> t
 
 @torch.no_grad()
 def likeliest(probs: Tensor) -> Tensor:
-    """``probs.argmax(1)`` of [N, K] for small K, the first of equals: torch's own takes 20 times as long where K is short."""
+    """``probs.argmax(1)`` of [N, K] for small K, the first of equals: torch's own takes 20 times as long where K is
+    short."""
     best = probs[:, 0]
     label = torch.zeros(len(probs), dtype=torch.int64, device=probs.device)
     for k in range(1, probs.shape[1]):
@@ -65,7 +69,8 @@ class _BlendMove(torch.autograd.Function):
 def part_motions(twists: Tensor) -> Tensor:
     """exp of the twists [K-1, 6] of the movable parts behind the identity of slot 0: [K, 4, 4], differentiable.
 
-    The same as ``se3.exp``, whose many small operations cost a training step a millisecond. float32 on the CPU takes the native code.
+    The same as ``se3.exp``, whose many small operations cost a training step a millisecond. float32 on the CPU takes
+    the native code.
     """
     if native is None or twists.dtype != torch.float32 or twists.device.type != "cpu":
         return torch.cat([torch.eye(4).to(twists)[None], se3.exp(twists)])

@@ -28,11 +28,12 @@ class Parts:
 
 
 def carry(means: Tensor, quats: Tensor, sh: Tensor, parts: Parts, transforms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Means [N, 3], quats [N, 4] (wxyz, turned) and SH [N, B, 3] (bands turned) after the motions transforms [K-1, 4, 4]. No gradient.
+    """Means [N, 3], quats [N, 4] (wxyz, turned) and SH [N, B, 3] (bands turned) after the motions transforms [K-1, 4,
+    4]. No gradient.
 
-    float32 on the CPU takes the native kernel (the same bits for any number of threads), anything else ``carry_reference``.
-    ``sh`` itself comes back where there is nothing to turn (B = 1).  Raises IndexError for a part without a motion, ValueError for
-    shapes that do not fit.
+    float32 on the CPU takes the native kernel (the same bits for any number of threads), anything else
+    ``carry_reference``. ``sh`` itself comes back where there is nothing to turn (B = 1).  Raises IndexError for a part
+    without a motion, ValueError for shapes that do not fit.
     """
     n = len(parts.labels)
     if means.shape != (n, 3) or quats.shape != (n, 4) or sh.shape[::2] != (n, 3) or transforms.shape[1:] != (4, 4):
@@ -64,7 +65,9 @@ def carry(means: Tensor, quats: Tensor, sh: Tensor, parts: Parts, transforms: Te
 
 
 @torch.no_grad()
-def carry_reference(means: Tensor, quats: Tensor, sh: Tensor, parts: Parts, transforms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def carry_reference(
+    means: Tensor, quats: Tensor, sh: Tensor, parts: Parts, transforms: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """``carry`` in torch, on any device."""
     transforms = torch.cat([torch.eye(4).to(means)[None], transforms.to(means)])
     T = transforms[parts.labels]
@@ -83,7 +86,8 @@ class RigidMoves:
         self.parts, self.transforms = Parts(labels), transforms
         self.back = torch.eye(4, dtype=transforms.dtype, device=transforms.device).expand_as(transforms).clone()
         self.back[:, :3, :3] = transforms[:, :3, :3].transpose(1, 2)
-        # q and -q turn alike, but a gradient by q knows which it was: of a half turn the inverse may come out as the other one
+        # q and -q turn alike, but a gradient by q knows which it was: of a half turn the inverse may come out as the
+        # other one
         still = torch.zeros(len(labels), 4).to(labels.device)
         still[:, 0] = 1
         there = carry(still[:, 1:], still, still[:, None, 1:], self.parts, transforms)[1]
@@ -111,4 +115,9 @@ class _Moved(torch.autograd.Function):
 @lru_cache(maxsize=None)
 def _tables(degree: int) -> Tensor:
     """What ``rotation_matrices`` knows of the bands, one behind the other, float64."""
-    return torch.cat([torch.zeros(0, dtype=torch.float64), *(t.flatten() for band in range(1, degree + 1) for t in band_tables(band))])
+    return torch.cat(
+        [
+            torch.zeros(0, dtype=torch.float64),
+            *(t.flatten() for band in range(1, degree + 1) for t in band_tables(band)),
+        ]
+    )

@@ -14,10 +14,10 @@ from p2gs.native import native, num_threads
 def knn(points: Tensor, queries: Optional[Tensor], k: int, exclude_self: bool = False) -> tuple[Tensor, Tensor]:
     """The k nearest of ``points`` to each of ``queries`` (None: the points themselves), nearest first, ties by index.
 
-    points [N, 3], queries [M, 3], finite.  exclude_self: query i is point i and shall not find itself; a twin at the same place
-    does count.  Returns (distances [M, k] in the points' dtype, indices [M, k] int64), both without gradient. The same bits for any
-    number of threads.
-    Raises ValueError when there are fewer than k points to find, when exclude_self is asked of foreign queries, or on NaN.
+    points [N, 3], queries [M, 3], finite.  exclude_self: query i is point i and shall not find itself; a twin at the
+    same place does count.  Returns (distances [M, k] in the points' dtype, indices [M, k] int64), both without
+    gradient. The same bits for any number of threads. Raises ValueError when there are fewer than k points to find,
+    when exclude_self is asked of foreign queries, or on NaN.
     """
     for name, x in (("points", points), ("queries", queries)):
         if x is None:
@@ -29,7 +29,9 @@ def knn(points: Tensor, queries: Optional[Tensor], k: int, exclude_self: bool = 
     if exclude_self and queries is not None and queries is not points:
         raise ValueError("exclude_self is for the points' own neighbours: give queries as None")
     if k < 1 or k + bool(exclude_self) > points.shape[0]:
-        raise ValueError(f"{k} neighbours asked of {points.shape[0]} points" + (", each without itself" if exclude_self else ""))
+        raise ValueError(
+            f"{k} neighbours asked of {points.shape[0]} points" + (", each without itself" if exclude_self else "")
+        )
     queries = None if queries is points else queries
     if native is None or points.dtype != torch.float32 or points.device.type != "cpu":
         return knn_reference(points, queries, k, exclude_self)
@@ -41,7 +43,17 @@ def knn(points: Tensor, queries: Optional[Tensor], k: int, exclude_self: bool = 
     index = torch.empty(asked, k, dtype=torch.int64)
     address = 0 if queries is None else queries.data_ptr()
     if asked:
-        native.knn(points.data_ptr(), count, address, asked, k, exclude_self, distance.data_ptr(), index.data_ptr(), num_threads())
+        native.knn(
+            points.data_ptr(),
+            count,
+            address,
+            asked,
+            k,
+            exclude_self,
+            distance.data_ptr(),
+            index.data_ptr(),
+            num_threads(),
+        )
     return distance, index
 
 

@@ -9,8 +9,15 @@ from torch import Tensor
 
 STATIC_COLOUR = (0.66, 0.68, 0.72)
 # distinct for colour-blind readers too (after Okabe and Ito), the brightest first
-MOVING_COLOURS = ((0.90, 0.45, 0.05), (0.10, 0.50, 0.85), (0.10, 0.65, 0.45), (0.85, 0.25, 0.55),
-                  (0.95, 0.80, 0.15), (0.50, 0.35, 0.80), (0.40, 0.75, 0.95))
+MOVING_COLOURS = (
+    (0.90, 0.45, 0.05),
+    (0.10, 0.50, 0.85),
+    (0.10, 0.65, 0.45),
+    (0.85, 0.25, 0.55),
+    (0.95, 0.80, 0.15),
+    (0.50, 0.35, 0.80),
+    (0.40, 0.75, 0.95),
+)
 
 
 def part_colour(part_id: int) -> tuple[float, float, float]:

@@ -30,10 +30,11 @@ def clamped_cross_entropy(pred: Tensor, target: Tensor, eps: float) -> Tensor:
 
 
 def depth_spread(alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float) -> Tensor:
-    """Mean of alpha depth_sq - (depth - ref alpha)^2 over the pixels with target > 1/2, a scalar; 0 where there are none.
+    """Mean of alpha depth_sq - (depth - ref alpha)^2 over the pixels with target > 1/2, a scalar; 0 where there are
+    none.
 
-    alpha, depth, depth_sq: as accumulated by the rasterizer (``RenderOutput``), depth_sq about ``ref``; target: the photograph's alpha.
-    All of one shape; differentiable by the first three. Raises ValueError for shapes that differ.
+    alpha, depth, depth_sq: as accumulated by the rasterizer (``RenderOutput``), depth_sq about ``ref``; target: the
+    photograph's alpha. All of one shape; differentiable by the first three. Raises ValueError for shapes that differ.
     """
     _same_shape("depth_spread", alpha, depth, depth_sq, target)
     if _fast(alpha, depth, depth_sq, target):
@@ -43,7 +44,8 @@ def depth_spread(alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor,
     return ((alpha * depth_sq - first * first) * inside).sum() / inside.sum().clamp_min(1)
 
 
-# The gradients are made in the backward pass: their factor is known there, and no pass over the pixels is spent on it alone.
+# The gradients are made in the backward pass: their factor is known there, and no pass over the pixels is spent on it
+# alone.
 
 
 class _CrossEntropy(torch.autograd.Function):
@@ -52,7 +54,9 @@ class _CrossEntropy(torch.autograd.Function):
         pred, target = pred.contiguous(), target.contiguous()
         ctx.save_for_backward(pred, target)
         ctx.eps = eps
-        return pred.new_tensor(native.cross_entropy(pred.data_ptr(), target.data_ptr(), 0, pred.numel(), eps, 1 - eps, 1.0, num_threads()))
+        return pred.new_tensor(
+            native.cross_entropy(pred.data_ptr(), target.data_ptr(), 0, pred.numel(), eps, 1 - eps, 1.0, num_threads())
+        )
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -70,20 +74,31 @@ class _DepthSpread(torch.autograd.Function):
         inputs = [t.contiguous() for t in (alpha, depth, depth_sq, target)]
         ctx.save_for_backward(*inputs)
         ctx.ref = ref
-        return alpha.new_tensor(native.depth_spread([*(t.data_ptr() for t in inputs), 0, 0, 0], alpha.numel(), ref, 1.0, num_threads()))
+        return alpha.new_tensor(
+            native.depth_spread([*(t.data_ptr() for t in inputs), 0, 0, 0], alpha.numel(), ref, 1.0, num_threads())
+        )
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_output):
         inputs = ctx.saved_tensors
         out = [torch.empty_like(inputs[0]) for _ in range(3)]
-        native.depth_spread([t.data_ptr() for t in (*inputs, *out)], out[0].numel(), ctx.ref, grad_output.item(), num_threads())
+        native.depth_spread(
+            [t.data_ptr() for t in (*inputs, *out)], out[0].numel(), ctx.ref, grad_output.item(), num_threads()
+        )
         return *out, None, None
 
 
 def compose(colour: Tensor, alpha8: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Premultiplied uint8 colour [H, W, 3] and alpha [H, W] over a background [3] in 0..1: float32 image [H, W, 3] and alpha [H, W]."""
-    if native is not None and colour.device.type == "cpu" and colour.is_contiguous() and alpha8.is_contiguous() and alpha8.numel():
+    """Premultiplied uint8 colour [H, W, 3] and alpha [H, W] over a background [3] in 0..1: float32 image [H, W, 3] and
+    alpha [H, W]."""
+    if (
+        native is not None
+        and colour.device.type == "cpu"
+        and colour.is_contiguous()
+        and alpha8.is_contiguous()
+        and alpha8.numel()
+    ):
         image, alpha = torch.empty(colour.shape), torch.empty(alpha8.shape)
         addresses = [t.data_ptr() for t in (colour, alpha8, image, alpha)]
         native.compose(*addresses, background.tolist(), alpha.numel(), num_threads())

@@ -1,4 +1,5 @@
-"""How much rendered surfaces bend where a photograph shows nothing: a native kernel with its gradient, and the same in torch."""
+"""How much rendered surfaces bend where a photograph shows nothing: a native kernel with its gradient, and the same in
+torch."""
 
 from __future__ import annotations
 
@@ -14,15 +15,23 @@ BREAK = 30.0  # contrasts that a step over the outline counts: nothing is left o
 
 
 def hidden_bends(
-    image: Tensor, target_alpha: Tensor, depth: Tensor, alpha: Tensor, strides: Sequence[int], contrast: float, noise: float
+    image: Tensor,
+    target_alpha: Tensor,
+    depth: Tensor,
+    alpha: Tensor,
+    strides: Sequence[int],
+    contrast: float,
+    noise: float,
 ) -> Optional[Tensor]:
-    """Weighted mean of |second difference of 1 / d| d^2 over segments of 2 x stride pixels along rows and columns; mean over all of these.
+    """Weighted mean of |second difference of 1 / d| d^2 over segments of 2 x stride pixels along rows and columns; mean
+    over all of these.
 
-    image [H, W, 3] in 0..1 and target_alpha [H, W]: the photograph.  depth, alpha [H, W]: accumulated; d is their quotient.
-    A segment weighs exp(-t / contrast), t the photograph's total variation along it less ``noise`` a pixel; nothing where it leaves the
-    inside. Weights count as one in all at least, and the factor d^2 has no gradient. A scalar in the unit of depth, differentiable by
-    depth and alpha, or None where no stride fits into the image. float32 on the CPU takes the native kernel (the same bits for any
-    number of threads), anything else ``hidden_bends_reference``.  Raises ValueError for shapes that do not fit.
+    image [H, W, 3] in 0..1 and target_alpha [H, W]: the photograph.  depth, alpha [H, W]: accumulated; d is their
+    quotient. A segment weighs exp(-t / contrast), t the photograph's total variation along it less ``noise`` a pixel;
+    nothing where it leaves the inside. Weights count as one in all at least, and the factor d^2 has no gradient. A
+    scalar in the unit of depth, differentiable by depth and alpha, or None where no stride fits into the image. float32
+    on the CPU takes the native kernel (the same bits for any number of threads), anything else
+    ``hidden_bends_reference``.  Raises ValueError for shapes that do not fit.
     """
     size = alpha.shape
     if alpha.ndim != 2 or depth.shape != size or target_alpha.shape != size or image.shape != (*size, 3):
@@ -35,7 +44,12 @@ def hidden_bends(
         return None
     inputs = (image, target_alpha, depth, alpha)
     fits = native is not None and min(strides) > 0 and contrast > 0
-    if not fits or image.requires_grad or target_alpha.requires_grad or any(t.dtype != torch.float32 or t.is_cuda for t in inputs):
+    if (
+        not fits
+        or image.requires_grad
+        or target_alpha.requires_grad
+        or any(t.dtype != torch.float32 or t.is_cuda for t in inputs)
+    ):
         return hidden_bends_reference(*inputs, strides, contrast, noise)
     return _HiddenBends.apply(*inputs, strides, float(contrast), float(noise))
 
@@ -59,7 +73,13 @@ class _HiddenBends(torch.autograd.Function):
 
 
 def hidden_bends_reference(
-    image: Tensor, target_alpha: Tensor, depth: Tensor, alpha: Tensor, strides: Sequence[int], contrast: float, noise: float
+    image: Tensor,
+    target_alpha: Tensor,
+    depth: Tensor,
+    alpha: Tensor,
+    strides: Sequence[int],
+    contrast: float,
+    noise: float,
 ) -> Optional[Tensor]:
     """``hidden_bends`` written for reading: any floating dtype and device."""
     inside = (target_alpha > COVERED) & (alpha.detach() > SOLID)
@@ -67,7 +87,8 @@ def hidden_bends_reference(
     total, count = depth.new_zeros(()), 0
     for picture, d, mask in ((image, depth, inside), (image.transpose(0, 1), depth.T, inside.T)):
         step = ((picture[1:] - picture[:-1]).abs().mean(-1) - noise).clamp_min(0)
-        # a step over the outline counts so much that nothing is left of the weight, and no more: sums keep their precision
+        # a step over the outline counts so much that nothing is left of the weight, and no more: sums keep their
+        # precision
         step = torch.where(mask[1:] & mask[:-1], step, torch.full_like(step, BREAK * contrast))
         travelled = torch.cat([step.new_zeros(1, step.shape[1]), step.cumsum(0)])
         inverse = 1 / d

@@ -29,14 +29,13 @@ def repel_force(
     """F_i = k_r sum_j (r_j - x_i) / max(|r_j - x_i|, eps)^exponent, clipped to length tau_max: [N, 3].
 
     points: [N, 3].  repel_points: [R, 3].  radius, eps, tau_max: in the units of the points.
-    reduce: "sum" is the paper to the letter (it doubles with twice the repel points, and reaches across the whole object);
-    "mean" divides by R; "local" is the mean over the repel points nearer than ``radius``, and zero where there are none; "within" is
-    the sum over those.
-    The direction is the paper's: *towards* the repel points. In the residual x + F - target of the articulation loss the optimum
-    x = target - F then lies away from them. Differentiable in both sets of points. Memory: ``chunk`` pairs at a time in the forward
-    pass (autograd keeps them all). On the CPU "local" and "within" visit only the pairs within the radius; in float32 and without a
-    gradient to the repel points a native kernel does all four, which keeps nothing by pair.
-    Raises ValueError when "local" or "within" has no radius.
+    reduce: "sum" is the paper to the letter (it doubles with twice the repel points, and reaches across the whole
+    object); "mean" divides by R; "local" is the mean over the repel points nearer than ``radius``, and zero where there
+    are none; "within" is the sum over those. The direction is the paper's: *towards* the repel points. In the residual
+    x + F - target of the articulation loss the optimum x = target - F then lies away from them. Differentiable in both
+    sets of points. Memory: ``chunk`` pairs at a time in the forward pass (autograd keeps them all). On the CPU "local"
+    and "within" visit only the pairs within the radius; in float32 and without a gradient to the repel points a native
+    kernel does all four, which keeps nothing by pair. Raises ValueError when "local" or "within" has no radius.
     """
     if reduce in ("local", "within") and (radius is None or radius <= 0):
         raise ValueError(f"repel_force(reduce='{reduce}') needs a positive radius")
@@ -60,7 +59,8 @@ def repel_force(
 
 
 def _pull(offset: Tensor, exponent: float, eps: float) -> tuple[Tensor, Tensor]:
-    """offset / max(|offset|, eps)^exponent, and |offset|^2; the floor comes before the root, so offset 0 has a finite gradient."""
+    """offset / max(|offset|, eps)^exponent, and |offset|^2; the floor comes before the root, so offset 0 has a finite
+    gradient."""
     sq = offset.square().sum(-1, keepdim=True)
     return offset * sq.clamp_min(eps * eps).pow(-0.5 * exponent), sq
 
@@ -76,11 +76,16 @@ def _dense(points: Tensor, repel_points: Tensor, exponent: float, eps: float, re
 
 def _native_applies(points: Tensor, repel_points: Tensor) -> bool:
     both = (points, repel_points)
-    return native is not None and not repel_points.requires_grad and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in both)
+    return (
+        native is not None
+        and not repel_points.requires_grad
+        and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in both)
+    )
 
 
 class _Native(torch.autograd.Function):
-    """Mean or summed pull of the repel points within ``radius``. Its slope by the point comes with it and waits for the backward pass."""
+    """Mean or summed pull of the repel points within ``radius``. Its slope by the point comes with it and waits for the
+    backward pass."""
 
     @staticmethod
     def forward(ctx, points, repel_points, exponent, eps, radius, mean):

@@ -1,7 +1,8 @@
-"""Rigid motions as 4x4 matrices and as twists xi = (omega, v), and the screw (axis, origin, angle, slide) that each one is.
+"""Rigid motions as 4x4 matrices and as twists xi = (omega, v), and the screw (axis, origin, angle, slide) that each one
+is.
 
-A twist is ordered rotation first: ``xi[..., :3]`` is the rotation vector in radians, ``xi[..., 3:]`` the linear part, in the
-units of the scene. Any batch shape, float32 or float64, gradients finite at zero and at pi.
+A twist is ordered rotation first: ``xi[..., :3]`` is the rotation vector in radians, ``xi[..., 3:]`` the linear part,
+in the units of the scene. Any batch shape, float32 or float64, gradients finite at zero and at pi.
 Formulas: arXiv:1812.01537 (exp, log); K. M. Lynch and F. C. Park, "Modern Robotics", 2017, section 3.3 (screws).
 """
 
@@ -20,7 +21,8 @@ class Screw(NamedTuple):
     """Chasles: turn by ``angle`` about the line (origin, axis) and slide by ``translation`` along it.
 
     axis [..., 3] unit; origin [..., 3] the line's point nearest the world origin; angle [...] radians in [0, pi];
-    translation [...] in scene units, signed along the axis. Without rotation: axis along the translation, origin 0, angle 0.
+    translation [...] in scene units, signed along the axis. Without rotation: axis along the translation, origin 0,
+    angle 0.
     """
 
     axis: Tensor
@@ -44,7 +46,8 @@ def inverse(T: Tensor) -> Tensor:
 
 
 def apply(T: Tensor, points: Tensor) -> Tensor:
-    """R p + t. T [..., 4, 4], points [..., N, 3] -> [..., N, 3] (batch shapes broadcast: T [K, 4, 4] on [N, 3] gives [K, N, 3])."""
+    """R p + t. T [..., 4, 4], points [..., N, 3] -> [..., N, 3] (batch shapes broadcast: T [K, 4, 4] on [N, 3] gives
+    [K, N, 3])."""
     return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
 
 
@@ -58,7 +61,9 @@ def _third(theta_sq: Tensor) -> Tensor:
 def _inverse_second(theta_sq: Tensor) -> Tensor:
     """(1 - theta sin(theta) / (2 (1 - cos(theta)))) / theta^2 of theta^2, for theta up to pi."""
     small, low, theta = so3._split(theta_sq)
-    near = so3._series(low, (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000, 1 / 74724249600))
+    near = so3._series(
+        low, (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000, 1 / 74724249600)
+    )
     return torch.where(small, near, (1 - 0.5 * theta * (0.5 * theta).cos() / (0.5 * theta).sin()) / theta.square())
 
 
@@ -88,8 +93,8 @@ def _is_matrix(x: Tensor) -> bool:
 def screw_at(motion: Tensor, s: Tensor | float) -> Tensor:
     """The fraction s of a motion along its screw, exp(s xi): [..., 4, 4].
 
-    motion: T [..., 4, 4] (xi = log T) or xi [..., 6].  s: number or tensor of the batch shape (or one that broadcasts); any real
-    number, so s = -1 is the inverse and s = 1.2 goes beyond the end.
+    motion: T [..., 4, 4] (xi = log T) or xi [..., 6].  s: number or tensor of the batch shape (or one that broadcasts);
+    any real number, so s = -1 is the inverse and s = 1.2 goes beyond the end.
     """
     xi = log(motion) if _is_matrix(motion) else motion
     return exp(xi * (s[..., None] if isinstance(s, Tensor) else s))
@@ -98,8 +103,9 @@ def screw_at(motion: Tensor, s: Tensor | float) -> Tensor:
 def screw_parameters(T: Tensor, min_angle: float = 1e-6) -> Screw:
     """The screw of a motion [..., 4, 4]. Below ``min_angle`` radians it counts as a pure translation.
 
-    The origin solves (I - R) o = t - (axis . t) axis; o = (t' + cot(angle / 2) axis x t') / 2 is that system's pseudo-inverse
-    solution in closed form (inverting I - R itself, as ancestors do, divides by round-off: its rank is 2).
+    The origin solves (I - R) o = t - (axis . t) axis; o = (t' + cot(angle / 2) axis x t') / 2 is that system's
+    pseudo-inverse solution in closed form (inverting I - R itself, as ancestors do, divides by round-off: its rank is
+    2).
     """
     w, t = so3.matrix_to_rotvec(T[..., :3, :3]), T[..., :3, 3]
     angle, length = w.norm(dim=-1, keepdim=True), t.norm(dim=-1, keepdim=True)
@@ -129,8 +135,8 @@ def from_screw(axis: Tensor, origin: Tensor, angle: Tensor | float, translation:
 def project_revolute(motion: Tensor) -> Tensor:
     """The nearest motion of zero pitch with the same rotation (no slide along the axis). No rotation: unchanged.
 
-    T [..., 4, 4] or xi [..., 6], returned in the same form. In an optimiser project the twist, or the step's tangent: projecting
-    T after every free step is known to stick.
+    T [..., 4, 4] or xi [..., 6], returned in the same form. In an optimiser project the twist, or the step's tangent:
+    projecting T after every free step is known to stick.
     """
     if _is_matrix(motion):
         w, t = so3.matrix_to_rotvec(motion[..., :3, :3]), motion[..., :3, 3]
@@ -141,13 +147,16 @@ def project_revolute(motion: Tensor) -> Tensor:
 def _remove_along(v: Tensor, w: Tensor) -> Tensor:
     sq = w.square().sum(-1, keepdim=True)
     turning = sq > 1e-12
-    return torch.where(turning, v - (v * w).sum(-1, keepdim=True) / torch.where(turning, sq, torch.ones_like(sq)) * w, v)
+    return torch.where(
+        turning, v - (v * w).sum(-1, keepdim=True) / torch.where(turning, sq, torch.ones_like(sq)) * w, v
+    )
 
 
 def project_prismatic(motion: Tensor, center: Optional[Tensor] = None) -> Tensor:
     """The pure translation that moves ``center`` [..., 3] (default: the world origin) as the motion does.
 
-    T [..., 4, 4] or xi [..., 6], returned in the same form. Give the part's centroid: a small spurious turn moves a far origin a lot.
+    T [..., 4, 4] or xi [..., 6], returned in the same form. Give the part's centroid: a small spurious turn moves a far
+    origin a lot.
     """
     T = motion if _is_matrix(motion) else exp(motion)
     R, t = T[..., :3, :3], T[..., :3, 3]

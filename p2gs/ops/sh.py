@@ -1,7 +1,8 @@
 """Real spherical harmonics up to degree 3, in the order and with the signs that 3DGS files use.
 
-Band l holds m = -l .. l, with the Condon-Shortley phase (so band 1 is -y, z, -x). Colour is 0.5 + sum_b Y_b(d) c_b, not clamped
-here. Formulas: any table of real spherical harmonics; rotation by collocation, exact because each band is closed under rotation.
+Band l holds m = -l .. l, with the Condon-Shortley phase (so band 1 is -y, z, -x). Colour is 0.5 + sum_b Y_b(d) c_b, not
+clamped here. Formulas: any table of real spherical harmonics; rotation by collocation, exact because each band is
+closed under rotation.
 """
 
 from __future__ import annotations
@@ -53,7 +54,13 @@ def basis(degree: int, directions: Tensor) -> Tensor:
     if degree >= 2:
         c = math.sqrt(15 / (4 * math.pi))
         xx, yy, zz = x * x, y * y, z * z
-        out += [c * x * y, -c * y * z, math.sqrt(5 / (16 * math.pi)) * (2 * zz - xx - yy), -c * x * z, 0.5 * c * (xx - yy)]
+        out += [
+            c * x * y,
+            -c * y * z,
+            math.sqrt(5 / (16 * math.pi)) * (2 * zz - xx - yy),
+            -c * x * z,
+            0.5 * c * (xx - yy),
+        ]
     if degree >= 3:
         c0, c1 = math.sqrt(7 / (16 * math.pi)), math.sqrt(21 / (32 * math.pi))
         c2, c3 = math.sqrt(105 / (4 * math.pi)), math.sqrt(35 / (32 * math.pi))
@@ -71,7 +78,8 @@ def basis(degree: int, directions: Tensor) -> Tensor:
 
 
 def evaluate(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tensor:
-    """Colour seen along unit directions (camera -> Gaussian): sh [..., B, 3], directions [..., 3] -> [..., 3], 0.5 + SH.
+    """Colour seen along unit directions (camera -> Gaussian): sh [..., B, 3], directions [..., 3] -> [..., 3], 0.5 +
+    SH.
 
     degree: use only the bands up to it (default: all that ``sh`` has).
     """
@@ -96,7 +104,8 @@ def band_tables(band: int) -> tuple[Tensor, Tensor]:
 
 
 def rotation_matrices(R: Tensor, degree: int) -> list[Tensor]:
-    """The bands' representation of R [..., 3, 3]: for l = 0 .. degree a [..., 2l+1, 2l+1] that maps coefficients to rotated ones."""
+    """The bands' representation of R [..., 3, 3]: for l = 0 .. degree a [..., 2l+1, 2l+1] that maps coefficients to
+    rotated ones."""
     num_bases(degree)
     out = [torch.ones_like(R[..., :1, :1])]
     for band in range(1, degree + 1):
@@ -110,8 +119,8 @@ def rotation_matrices(R: Tensor, degree: int) -> list[Tensor]:
 def rotate_sh(sh: Tensor, R: Tensor, index: Tensor | None = None) -> Tensor:
     """Coefficients of the colour function turned by R, so that evaluate(rotate_sh(sh, R), R d) = evaluate(sh, d).
 
-    sh [..., B, 3]; R [..., 3, 3] of the same batch shape (or one that broadcasts); with ``index`` [N] int64, R is [K, 3, 3] and
-    Gaussian n of sh [N, B, 3] is turned by R[index[n]] (the matrices are then made once a part).
+    sh [..., B, 3]; R [..., 3, 3] of the same batch shape (or one that broadcasts); with ``index`` [N] int64, R is [K,
+    3, 3] and Gaussian n of sh [N, B, 3] is turned by R[index[n]] (the matrices are then made once a part).
     """
     degree = degree_of(sh.shape[-2])
     bands = []

@@ -1,8 +1,8 @@
 """Rotations: quaternions (wxyz), matrices and rotation vectors, for any batch shape, in float32 or float64.
 
-Every function keeps its gradients finite at angle 0 and at angle pi. Formulas: J. Sola et al., "A micro Lie theory for state
-estimation in robotics" (arXiv:1812.01537); S. W. Shepperd, "Quaternion from rotation matrix" (doi:10.2514/3.55767b); W. Kabsch
-(doi:10.1107/S0567739476001873).
+Every function keeps its gradients finite at angle 0 and at angle pi. Formulas: J. Sola et al., "A micro Lie theory for
+state estimation in robotics" (arXiv:1812.01537); S. W. Shepperd, "Quaternion from rotation matrix"
+(doi:10.2514/3.55767b); W. Kabsch (doi:10.1107/S0567739476001873).
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from typing import Optional
 import torch
 from torch import Tensor
 
-# Below this squared angle the Taylor series are exact to float64 and, unlike the closed forms, lose no digits in the backward pass.
+# Below this squared angle the Taylor series are exact to float64 and, unlike the closed forms, lose no digits in the
+# backward pass.
 SERIES_BELOW = 0.25
 
 
@@ -26,7 +27,11 @@ def _series(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
 def _split(theta_sq: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """(is small, theta^2 where small else 0, theta where large else 1): each branch sees only values it is good at."""
     small = theta_sq < SERIES_BELOW
-    return small, torch.where(small, theta_sq, torch.zeros_like(theta_sq)), torch.where(small, torch.ones_like(theta_sq), theta_sq).sqrt()
+    return (
+        small,
+        torch.where(small, theta_sq, torch.zeros_like(theta_sq)),
+        torch.where(small, torch.ones_like(theta_sq), theta_sq).sqrt(),
+    )
 
 
 def sinc(theta_sq: Tensor) -> Tensor:
@@ -98,7 +103,8 @@ def quat_to_matrix(q: Tensor) -> Tensor:
 def matrix_to_quat(R: Tensor) -> Tensor:
     """Rotation [..., 3, 3] -> unit quaternion [..., 4] with w >= 0.
 
-    R determines 4 q q^T linearly; the row of the largest component is q up to a factor >= 1, so nothing small is ever divided by.
+    R determines 4 q q^T linearly; the row of the largest component is q up to a factor >= 1, so nothing small is ever
+    divided by.
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = R.flatten(-2).unbind(-1)
     wx, wy, wz, xy, xz, yz = r21 - r12, r02 - r20, r10 - r01, r01 + r10, r02 + r20, r12 + r21
@@ -131,7 +137,11 @@ def matrix_to_rotvec(R: Tensor) -> Tensor:
     s_sq = v.square().sum(-1, keepdim=True)
     small = s_sq < 0.01
     x = torch.where(small, s_sq, torch.zeros_like(s_sq)) / torch.where(small, w, torch.ones_like(w)).square()
-    near = 2 * _series(x, (1.0, -1 / 3, 1 / 5, -1 / 7, 1 / 9, -1 / 11, 1 / 13, -1 / 15)) / torch.where(small, w, torch.ones_like(w))
+    near = (
+        2
+        * _series(x, (1.0, -1 / 3, 1 / 5, -1 / 7, 1 / 9, -1 / 11, 1 / 13, -1 / 15))
+        / torch.where(small, w, torch.ones_like(w))
+    )
     s = torch.where(small, torch.ones_like(s_sq), s_sq).sqrt()
     return v * torch.where(small, near, 2 * torch.atan2(s, w) / s)
 
@@ -139,7 +149,8 @@ def matrix_to_rotvec(R: Tensor) -> Tensor:
 def rotation_angle(A: Tensor, B: Optional[Tensor] = None) -> Tensor:
     """Geodesic angle in radians, [0, pi], of A, or between A and B: [..., 3, 3] -> [...].
 
-    By atan2 of sine and cosine, exact near 0 and pi where arccos is not; at exactly 0 and pi the gradient is taken as zero.
+    By atan2 of sine and cosine, exact near 0 and pi where arccos is not; at exactly 0 and pi the gradient is taken as
+    zero.
     """
     D = A if B is None else A.transpose(-1, -2) @ B
     v = torch.stack([D[..., 2, 1] - D[..., 1, 2], D[..., 0, 2] - D[..., 2, 0], D[..., 1, 0] - D[..., 0, 1]], -1)
@@ -151,7 +162,8 @@ def rotation_angle(A: Tensor, B: Optional[Tensor] = None) -> Tensor:
 
 @torch.no_grad()
 def nearest_rotation(H: Tensor) -> Tensor:
-    """The rotation R that makes trace(R H) greatest, never a reflection, [..., 3, 3]; H: sum of source times target transposed."""
+    """The rotation R that makes trace(R H) greatest, never a reflection, [..., 3, 3]; H: sum of source times target
+    transposed."""
     U, _, Vh = torch.linalg.svd(H)
     V, Ut = Vh.transpose(-1, -2), U.transpose(-1, -2)
     flip = torch.ones_like(H[..., 0])
@@ -163,9 +175,9 @@ def nearest_rotation(H: Tensor) -> Tensor:
 def kabsch(src: Tensor, dst: Tensor, weights: Optional[Tensor] = None) -> tuple[Tensor, Tensor]:
     """The rigid motion minimising sum_n w_n |R src_n + t - dst_n|^2, never a reflection.
 
-    src, dst: [..., N, 3].  weights: [..., N], >= 0, or None; batch shapes broadcast (weights [K, N] with src [N, 3] fits K parts).
-    Returns R [..., 3, 3], t [..., 3]; no mass gives the identity. Points on a line leave the turn about it free.
-    Carries no gradient: what is minimal at (R, t) has no first-order dependence on them, so losses need none.
+    src, dst: [..., N, 3].  weights: [..., N], >= 0, or None; batch shapes broadcast (weights [K, N] with src [N, 3]
+    fits K parts). Returns R [..., 3, 3], t [..., 3]; no mass gives the identity. Points on a line leave the turn about
+    it free. Carries no gradient: what is minimal at (R, t) has no first-order dependence on them, so losses need none.
     """
     if weights is None:
         weights = torch.ones_like(src[..., 0])

@@ -1,7 +1,7 @@
 """The photometric loss of 3D Gaussian splatting, L1 plus D-SSIM, and the image measures SSIM and PSNR.
 
-SSIM is Wang et al. 2004 (doi:10.1109/TIP.2003.819861): 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, images in
-[0, 1], zero padding, mean over pixels and channels. D-SSIM is 1 - SSIM, as in 3DGS practice.
+SSIM is Wang et al. 2004 (doi:10.1109/TIP.2003.819861): 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2,
+images in [0, 1], zero padding, mean over pixels and channels. D-SSIM is 1 - SSIM, as in 3DGS practice.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def l1_ssim(
 ) -> Tensor:
     """(1 - ssim_lambda) mean|pred - target| + ssim_lambda (1 - SSIM(pred, target)), a scalar differentiable by pred.
 
-    pred, target: [H, W, 3] in [0, 1].  mask_box: (x, y, width, height); the loss of that window alone, as if both images were
-    cropped to it.  cache, key: a mapping in which the window means of the target are kept between calls, under ("l1_ssim", key).
-    They are used again only for the same tensor in the same memory and unchanged, so a target that is composed anew each step is
-    merely not cached.
+    pred, target: [H, W, 3] in [0, 1].  mask_box: (x, y, width, height); the loss of that window alone, as if both
+    images were cropped to it.  cache, key: a mapping in which the window means of the target are kept between calls,
+    under ("l1_ssim", key). They are used again only for the same tensor in the same memory and unchanged, so a target
+    that is composed anew each step is merely not cached.
 
     float32 CPU images take the native kernel (value and gradient in one pass), all others ``l1_ssim_reference``.
     Raises ValueError when the shapes do not fit.
@@ -114,7 +114,8 @@ def _statistics(cache, key, target: Tensor) -> tuple[bool, Tensor]:
     if isinstance(entry, TargetStatistics) and entry.belongs_to(target):
         return True, entry.planes
     planes = target.new_empty(2, height, native.ssim_padded(3 * width))
-    # A second, different target under the same key: it is composed anew for each step, keeping it would only cost memory.
+    # A second, different target under the same key: it is composed anew for each step, keeping it would only cost
+    # memory.
     cache[key] = TargetStatistics(target, target._version, planes) if key not in cache else None
     return False, planes
 

@@ -6,8 +6,8 @@ import numpy as np
 
 
 def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """rows [N, K] integers.  Returns (index [U] of each distinct row's first occurrence, in lexicographic order of the rows;
-    inverse [N], which of them each row is), int64."""
+    """rows [N, K] integers.  Returns (index [U] of each distinct row's first occurrence, in lexicographic order of the
+    rows; inverse [N], which of them each row is), int64."""
     n = len(rows)
     if n == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)

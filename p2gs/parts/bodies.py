@@ -1,6 +1,8 @@
-"""A part is one body: pieces of one motion are one part only where they touch or can be joined through space that nobody saw empty.
+"""A part is one body: pieces of one motion are one part only where they touch or can be joined through space that
+nobody saw empty.
 
-Two flaps or drawers a hand apart that travel alike look like one motion. They are two parts, each with a motion of its own.
+Two flaps or drawers a hand apart that travel alike look like one motion. They are two parts, each with a motion of its
+own.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.ops import se3
 from p2gs.visibility.depth_stack import DepthStack, classify
 
-TOUCH = 2.5  # points nearer than this, in spacings, lie on one surface: two, and the spacing is the median of an uneven sample
+# points nearer than this, in spacings, lie on one surface: two, and the spacing is the median of an uneven sample
+TOUCH = 2.5
 FEWEST = 30  # points of a body in each state: a plate of 5 x 6 of them
 BRIDGES = 256  # lines between two pieces that are tried, from the shortest up
 STOPS = 9  # points looked at on each line
@@ -26,8 +29,8 @@ STOPS = 9  # points looked at on each line
 
 @dataclass
 class Surfaces:
-    """Surface points [N, 3] of both states with the parts [N] that they belong to (0 static), how far apart they lie, and the states'
-    rendered depth with its tolerance along the ray (internal units)."""
+    """Surface points [N, 3] of both states with the parts [N] that they belong to (0 static), how far apart they lie,
+    and the states' rendered depth with its tolerance along the ray (internal units)."""
 
     points: list[Tensor]
     labels: list[Tensor]
@@ -40,11 +43,14 @@ def pieces(points: Tensor, reach: float) -> np.ndarray:
     """Connected component [N] of points [N, 3], joined where they are nearer than ``reach``."""
     pairs = cKDTree(points.numpy()).query_pairs(reach, output_type="ndarray")
     n = len(points)
-    return connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (n, n)), directed=False)[1]
+    return connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (n, n)), directed=False)[
+        1
+    ]
 
 
 def seen_empty(points: Tensor, motion: Tensor, stacks: list[DepthStack], tau: float) -> Tensor:
-    """[N] bool: did either state's cameras look through this place of a part? points [N, 3] at the start; motion [4, 4]; tau: tolerance."""
+    """[N] bool: did either state's cameras look through this place of a part? points [N, 3] at the start; motion [4,
+    4]; tau: tolerance."""
     empty = torch.zeros(len(points), dtype=torch.bool)
     for s, stack in enumerate(stacks):
         x = se3.apply(motion, points) if s else points
@@ -53,9 +59,11 @@ def seen_empty(points: Tensor, motion: Tensor, stacks: list[DepthStack], tau: fl
     return empty
 
 
-def bridged(a: Tensor, b: Tensor, motion: Tensor, stacks: list[DepthStack], tau: float, others: cKDTree | None, reach: float) -> bool:
-    """Can two pieces [N, 3], [M, 3] (at the start) be one body: is some line between them nowhere seen empty, nor near another part's
-    surface (``others``, at the start, within ``reach``)?"""
+def bridged(
+    a: Tensor, b: Tensor, motion: Tensor, stacks: list[DepthStack], tau: float, others: cKDTree | None, reach: float
+) -> bool:
+    """Can two pieces [N, 3], [M, 3] (at the start) be one body: is some line between them nowhere seen empty, nor near
+    another part's surface (``others``, at the start, within ``reach``)?"""
     d, j = cKDTree(b.numpy()).query(a.numpy())
     order = np.argsort(d, kind="stable")
     order = order[np.unique(np.linspace(0, len(order) - 1, min(BRIDGES, len(order))).astype(int))]
@@ -68,8 +76,8 @@ def bridged(a: Tensor, b: Tensor, motion: Tensor, stacks: list[DepthStack], tau:
 
 
 def bodies_of(surfaces: Surfaces, part: int, motion: Tensor) -> list[list[Tensor]]:
-    """The bodies that a part consists of, the largest first, each as its rows of either state's points; none of fewer than ``FEWEST`` in
-    a state (what one state alone shows may be anything).  motion [4, 4] start -> end.
+    """The bodies that a part consists of, the largest first, each as its rows of either state's points; none of fewer
+    than ``FEWEST`` in a state (what one state alone shows may be anything).  motion [4, 4] start -> end.
     """
     rows = [(of == part + 1).nonzero().squeeze(1) for of in surfaces.labels]
     if min(map(len, rows)) < 2 * FEWEST:
@@ -102,7 +110,8 @@ def bodies_of(surfaces: Surfaces, part: int, motion: Tensor) -> list[list[Tensor
 def one_part_a_body(
     states: list[StateGaussians], motions: PartMotions, surfaces: Surfaces, limit: int
 ) -> tuple[PartMotions, list[dict]]:
-    """Each part that consists of several bodies as that many parts, at most ``limit`` in all, with the same motion to begin with.
+    """Each part that consists of several bodies as that many parts, at most ``limit`` in all, with the same motion to
+    begin with.
 
     Every Gaussian of the part goes to the body next to it. Returns the motions and what was split.
     """

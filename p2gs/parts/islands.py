@@ -1,8 +1,8 @@
 """A part is one body: pieces of its label that hang apart from it, amid another's surface, belong to that surface.
 
-Two motions can carry the same patch onto some surface of the other state by chance (the side of an opened drawer, turned with
-the door below it, lands on the cupboard's front). Such patches are small and lie apart from the part that lent its motion; a few dozen
-Gaussians of them shift a hinge by tenths of a degree.
+Two motions can carry the same patch onto some surface of the other state by chance (the side of an opened drawer,
+turned with the door below it, lands on the cupboard's front). Such patches are small and lie apart from the part that
+lent its motion; a few dozen Gaussians of them shift a hinge by tenths of a degree.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ NEAR = 4.0  # spacings between neighbours on one surface
 
 
 def pieces(points: Tensor, labels: Tensor, k: int = 8) -> Tensor:
-    """Connected pieces of equal label on the graph of k nearest neighbours within ``NEAR`` spacings: a number for each point, [N]."""
+    """Connected pieces of equal label on the graph of k nearest neighbours within ``NEAR`` spacings: a number for each
+    point, [N]."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -36,7 +37,8 @@ def pieces(points: Tensor, labels: Tensor, k: int = 8) -> Tensor:
 
 
 def find_islands(points: Tensor, labels: Tensor, share: float) -> Tensor:
-    """Number [N] of the piece of those points whose piece is smaller than ``share`` of its part's largest, -1 for the rest.
+    """Number [N] of the piece of those points whose piece is smaller than ``share`` of its part's largest, -1 for the
+    rest.
 
     points [N, 3]; labels [N]. The base (label 0) may be in many pieces and has no islands.
     """
@@ -54,12 +56,14 @@ def find_islands(points: Tensor, labels: Tensor, share: float) -> Tensor:
 
 
 @torch.no_grad()
-def settle_islands(states: list[GaussianTensors], labels: list[Tensor], transforms: Tensor, share: float) -> tuple[list[Tensor], list[int]]:
+def settle_islands(
+    states: list[GaussianTensors], labels: list[Tensor], transforms: Tensor, share: float
+) -> tuple[list[Tensor], list[int]]:
     """Give islands the label of what they touch; where they touch nothing they keep theirs.
 
-    states: Gaussians of the start and of the end; labels [N] of each; transforms [K-1, 4, 4] start -> end.  An island that its motion
-    lays for the greater part on the body of the same part in the other state is no island (the inside of a drawer behind its
-    front). Returns (labels, how many solid Gaussians changed) by state.
+    states: Gaussians of the start and of the end; labels [N] of each; transforms [K-1, 4, 4] start -> end.  An island
+    that its motion lays for the greater part on the body of the same part in the other state is no island (the inside
+    of a drawer behind its front). Returns (labels, how many solid Gaussians changed) by state.
     """
     if share <= 0 or len(transforms) == 0:
         return labels, [0] * len(labels)
@@ -81,13 +85,21 @@ def settle_islands(states: list[GaussianTensors], labels: list[Tensor], transfor
 
 @torch.no_grad()
 def settle_twin_islands(
-    g: GaussianTensors, labels: Tensor, share: float, away: Tensor, stack: DepthStack, tau: float, held: Tensor | None = None
+    g: GaussianTensors,
+    labels: Tensor,
+    share: float,
+    away: Tensor,
+    stack: DepthStack,
+    tau: float,
+    held: Tensor | None = None,
 ) -> Tensor:
     """Labels [N] of a twin, posed in one state, with islands given to what they touch there.
 
-    The twin holds what both states show of a part: a piece that hangs apart from it here has no counterpart elsewhere to speak for it. It
-    stays nevertheless where the other state's cameras would see through more of it under the new label than under the old.
-    away [K, 4, 4]: motions to the other state, slot 0 included; stack: its rendered depth; tau: tolerance along the ray (scene units).
+    The twin holds what both states show of a part: a piece that hangs apart from it here has no counterpart elsewhere
+    to speak for it. It stays nevertheless where the other state's cameras would see through more of it under the new
+    label than under the old.
+    away [K, 4, 4]: motions to the other state, slot 0 included; stack: its rendered depth; tau: tolerance along the ray
+    (scene units).
     held [N] bool: known to be their part's; what holds more of these than others is no island.
     """
     rows = (torch.sigmoid(g.opacity_logits) > SOLID).nonzero().squeeze(1)
@@ -112,7 +124,8 @@ def settle_twin_islands(
 
 
 def _with_faint(means: Tensor, labels: Tensor, rows: Tensor, new: Tensor) -> Tensor:
-    """Labels [N] where the solid Gaussians ``rows`` have ``new`` ones; the faint ones go with the surface that they are at."""
+    """Labels [N] where the solid Gaussians ``rows`` have ``new`` ones; the faint ones go with the surface that they are
+    at."""
     old = labels[rows]
     nearest = knn(means[rows], means, 1, False)[1][:, 0]
     follows = (old[nearest] == labels) & (new[nearest] != old[nearest])
@@ -121,9 +134,11 @@ def _with_faint(means: Tensor, labels: Tensor, rows: Tensor, new: Tensor) -> Ten
     return out
 
 
-def _lands(points: Tensor, T: Tensor, other: Tensor, other_body: Tensor, rows: Tensor, part: int, spacing: Tensor) -> bool:
-    """Whether the part's motion T[part - 1] lays most of ``points[rows]`` on the body of the same part among the other state's points
-    ``other`` (``other_body``: their labels, -1 for islands)."""
+def _lands(
+    points: Tensor, T: Tensor, other: Tensor, other_body: Tensor, rows: Tensor, part: int, spacing: Tensor
+) -> bool:
+    """Whether the part's motion T[part - 1] lays most of ``points[rows]`` on the body of the same part among the other
+    state's points ``other`` (``other_body``: their labels, -1 for islands)."""
     distance, index = knn(other, se3.apply(T[part - 1].to(points), points[rows]), 1, False)
     return bool(((distance[:, 0] < NEAR * spacing) & (other_body[index[:, 0]] == part)).float().mean() > 0.5)
 
@@ -135,8 +150,8 @@ def _settle(
     lands: Callable[[Tensor, int, Tensor], bool] | None = None,
     fits: Callable[[Tensor, int], bool] | None = None,
 ) -> Tensor:
-    """Labels with islands given away. lands: whether one (rows, part, spacing of the points) is none, by the other state; fits: whether
-    one (rows) may go to a part."""
+    """Labels with islands given away. lands: whether one (rows, part, spacing of the points) is none, by the other
+    state; fits: whether one (rows) may go to a part."""
     labels = labels.clone()
     main = (island < 0).nonzero().squeeze(1)
     if len(main) < 10:

@@ -1,9 +1,9 @@
 """Whose is what a part hides while it is shut: what comes out of a body behind a front belongs to that front.
 
-The inside of a drawer is seen when the drawer is open. Shut, its own front hides it, under any motion that carries it back, so the other
-state cannot tell whether it went with this drawer, the one below or a door. But it can tell what it lies behind. Doors hardly have
-insides that go with them: what lies behind a door stays whose it was. What its part hides from no view, and what is as hidden where it
-is, need not have moved.
+The inside of a drawer is seen when the drawer is open. Shut, its own front hides it, under any motion that carries it
+back, so the other state cannot tell whether it went with this drawer, the one below or a door. But it can tell what it
+lies behind. Doors hardly have insides that go with them: what lies behind a door stays whose it was. What its part
+hides from no view, and what is as hidden where it is, need not have moved.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.models.canonical import with_static
-from p2gs.models.single_state import render_gaussians
+from p2gs.gaussians.pose import with_static
 from p2gs.ops import se3
 from p2gs.ops.blend import likeliest
 from p2gs.parts.patches import patches
@@ -36,14 +36,18 @@ def label_maps(g: GaussianTensors, labels: Tensor, count: int, stack: DepthStack
     chunks = torch.nn.functional.one_hot(labels, count).float().split(MAX_FEATURES, 1)
     g, maps = g.to(device), torch.zeros(stack.depth.shape, dtype=torch.int64)
     for out, camera in zip(maps, stack.cameras, strict=True):
-        shares = [render_gaussians(g, camera.to(device), features=c.to(device), backend=backend).features.cpu() for c in chunks]
+        shares = [
+            render_gaussians(g, camera.to(device), features=c.to(device), backend=backend).features.cpu()
+            for c in chunks
+        ]
         share = torch.cat(shares, -1)
         out[: camera.height, : camera.width] = likeliest(share.flatten(0, 1)).reshape(share.shape[:2])
     return maps
 
 
 def hiders(points: Tensor, stack: DepthStack, maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """How often each part is what a view sees before each point, [N, count]; and how many views see the point or past it, [N].
+    """How often each part is what a view sees before each point, [N, count]; and how many views see the point or past
+    it, [N].
 
     maps [V, H, W]: what part the stack's first views see.
     """
@@ -65,9 +69,10 @@ def owners(
 ) -> Tensor:
     """Labels [N] of one state's Gaussians, those of hidden ones by what hides them in the other state.
 
-    labels [N]; transforms [K-1, 4, 4] to the other state; stack, maps: its rendered depth and ``label_maps``.  rows [M]: Gaussians that may
-    change, in ``groups`` [M] that change together: from a moving part to another one, of the ``takers`` [K] bool, that hides them, carried
-    by its motion, ``CLEARLY`` more often; or to the base, under which they are hidden, too, from one that hides them from no view.
+    labels [N]; transforms [K-1, 4, 4] to the other state; stack, maps: its rendered depth and ``label_maps``.  rows
+    [M]: Gaussians that may change, in ``groups`` [M] that change together: from a moving part to another one, of the
+    ``takers`` [K] bool, that hides them, carried by its motion, ``CLEARLY`` more often; or to the base, under which
+    they are hidden, too, from one that hides them from no view.
     """
     T = with_static(transforms).to(g.means)
     count, n = len(T), int(groups.max()) + 1 if len(groups) else 0
@@ -99,7 +104,8 @@ def owners(
 def hidden_to_owners(
     states: list[StateGaussians], motions: PartMotions, stacks: list[DepthStack], *, backend: str, device="cpu"
 ) -> tuple[PartMotions, list[int]]:
-    """The motions with what the other state hides given to the sliding parts that hide it (``owners``), and how many changed, by state.
+    """The motions with what the other state hides given to the sliding parts that hide it (``owners``), and how many
+    changed, by state.
 
     stacks: rendered depth of both states.
     """

@@ -14,8 +14,9 @@ from p2gs.ops.knn import knn
 
 
 def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None) -> PartMotions:
-    """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the energy does not rise;
-    drop a part, too, that saves less of the image loss than a further one must (``judge.further``).
+    """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the
+    energy does not rise; drop a part, too, that saves less of the image loss than a further one must
+    (``judge.further``).
 
     log: told of each part that goes: what was done, its type, image loss with and without it, what the energy gains.
     """
@@ -40,8 +41,9 @@ def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[d
 
 
 def join_twins(states, motions: PartMotions, reach: float) -> tuple[PartMotions, list[dict]]:
-    """One part for every two that touch and whose motions carry the smaller one's points to within ``reach`` (internal units) of each other:
-    nothing tells them from one body.  Returns the motions and the types of those that went, with the parts that they joined."""
+    """One part for every two that touch and whose motions carry the smaller one's points to within ``reach`` (internal
+    units) of each other: nothing tells them from one body.  Returns the motions and the types of those that went, with
+    the parts that they joined."""
     log: list[dict] = []
     while (pair := next((c for c in _reductions(states, motions, reach) if c[0][0] == "merge"), None)) is not None:
         (_, small, large), reduced = pair
@@ -51,10 +53,14 @@ def join_twins(states, motions: PartMotions, reach: float) -> tuple[PartMotions,
 
 
 def _reductions(states, motions: PartMotions, same_motion: float):
-    """Explanations with one part less: (what changed, motions). Merging comes first, small parts go before large ones."""
+    """Explanations with one part less: (what changed, motions). Merging comes first, small parts go before large
+    ones."""
     solid = [torch.sigmoid(s.gaussians.opacity_logits) > 0.5 for s in states]
     points = [
-        [s.gaussians.means[of & (lab == k + 1)].double() for s, of, lab in zip(states, solid, motions.labels, strict=True)]
+        [
+            s.gaussians.means[of & (lab == k + 1)].double()
+            for s, of, lab in zip(states, solid, motions.labels, strict=True)
+        ]
         for k in range(len(motions))
     ]
     order = sorted(range(len(motions)), key=lambda k: len(points[k][0]))
@@ -74,7 +80,8 @@ def _reductions(states, motions: PartMotions, same_motion: float):
 
 
 def _touch(a: Tensor, b: Tensor) -> bool:
-    """Whether two point sets [N, 3], [M, 3] come as near to each other somewhere as the smaller one's points are to theirs."""
+    """Whether two point sets [N, 3], [M, 3] come as near to each other somewhere as the smaller one's points are to
+    theirs."""
     if len(a) > len(b):
         a, b = b, a
     spacing = knn(a, None, 1, True)[0].median()
@@ -82,7 +89,8 @@ def _touch(a: Tensor, b: Tensor) -> bool:
 
 
 def without_part(motions: PartMotions, index: int, into: int) -> PartMotions:
-    """The same motions without entry ``index``; its Gaussians get label ``into`` (numbered as before: 0 static, k + 1 for entry k)."""
+    """The same motions without entry ``index``; its Gaussians get label ``into`` (numbered as before: 0 static, k + 1
+    for entry k)."""
     keep = [k for k in range(len(motions)) if k != index]
     renumber = torch.zeros(len(motions) + 1, dtype=torch.int64)
     for new, old in enumerate(keep):
@@ -90,12 +98,18 @@ def without_part(motions: PartMotions, index: int, into: int) -> PartMotions:
     renumber[index + 1] = renumber[into]
     labels = [renumber[old] for old in motions.labels]
     return PartMotions(
-        [motions.types[k] for k in keep], motions.transforms[keep], motions.confidence[keep], labels, motions.margin, motions.diagnostics
+        [motions.types[k] for k in keep],
+        motions.transforms[keep],
+        motions.confidence[keep],
+        labels,
+        motions.margin,
+        motions.diagnostics,
     )
 
 
 def settle_types(judge: Judge, motions: PartMotions, below: float, penalty: float) -> PartMotions:
-    """Fit both joint types where a part turns by less than ``below`` (degrees), keep the one the images prefer; then refine with the types held.
+    """Fit both joint types where a part turns by less than ``below`` (degrees), keep the one the images prefer; then
+    refine with the types held.
 
     penalty: share of the image loss by which a turn must win: it has two freedoms more.
     """
@@ -113,7 +127,8 @@ def settle_types(judge: Judge, motions: PartMotions, below: float, penalty: floa
 
 
 def _as_slides(states, motions: PartMotions, k: int) -> list[PartMotions]:
-    """The same with part k a slide that carries its middle where it goes, or as far as that is along the slide of another part."""
+    """The same with part k a slide that carries its middle where it goes, or as far as that is along the slide of
+    another part."""
     own = states[0].gaussians.means[motions.labels[0] == k + 1].double()
     centre = own.mean(0) if len(own) else torch.zeros(3).double()
     way = se3.apply(motions.transforms[k], centre[None])[0] - centre

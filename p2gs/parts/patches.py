@@ -5,14 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from p2gs.models.canonical import farthest_points
+from p2gs.motion.matching import farthest_points
 from p2gs.ops import so3
 from p2gs.ops.sh import dc_to_rgb
 from p2gs.types import GaussianTensors
 
 
 def patches(g: GaussianTensors, size: int, rounds: int = 10) -> Tensor:
-    """Patch [N] of each Gaussian: near, alike in facing and colour, ``size`` in the mean (k-means from farthest points)."""
+    """Patch [N] of each Gaussian: near, alike in facing and colour, ``size`` in the mean (k-means from farthest
+    points)."""
     R = so3.quat_to_matrix(so3.quat_normalize(g.quats))
     normal = R[torch.arange(len(g)), :, g.log_scales.argmin(1)]
     facing = (normal[:, :, None] * normal[:, None]).flatten(1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,10 +12,8 @@ from p2gs.motion.discovery import Candidate, Discovery, in_two, instead_of, plac
 from p2gs.motion.refine_motions import Judge
 from p2gs.ops.sh import dc_to_rgb
 from p2gs.parts.islands import settle_islands
+from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import settle_types, without_part
-
-if TYPE_CHECKING:
-    from p2gs.models.part_discovery import PartMotionsConfig
 
 
 def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
@@ -29,16 +26,18 @@ def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tup
     return labels, margin
 
 
-def reconsider(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:
-    """Exchange motions for others that explain what the refined rest leaves over, those of two like parts for such as change their ends, add
-    one, or make one part two, while the energy falls.
+def reconsider(
+    judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig
+) -> tuple[PartMotions, list[dict]]:
+    """Exchange motions for others that explain what the refined rest leaves over, those of two like parts for such as
+    change their ends, add one, or make one part two, while the energy falls.
 
-    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such as take each for the
-    other at the end (``places_changed``), and for each part the two amounts about one axis that explain most (``in_two``). Under each proposal
-    every surfel chooses its part anew, and with the ``candidates`` of each kind that surfaces like best the states are re-rendered. The best
-    of each kind is refined, and the energy must fall; with a further part the image loss must as well (``judge.further``): what surfaces
-    alone gain is junk.
-    Returns the motions and what was tried.
+    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such as
+    take each for the other at the end (``places_changed``), and for each part the two amounts about one axis that
+    explain most (``in_two``). Under each proposal every surfel chooses its part anew, and with the ``candidates`` of
+    each kind that surfaces like best the states are re-rendered. The best of each kind is refined, and the energy must
+    fall; with a further part the image loss must as well (``judge.further``): what surfaces alone gain is junk. Returns
+    the motions and what was tried.
     """
     found, states, log = judge.found, judge.states, []
     lowest, cost = judge(motions)
@@ -87,11 +86,14 @@ def _relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:
     """The same motions with labels chosen anew, and discovery's confidence in them under these."""
     explanation = relabel(found, motions.transforms, motions.types)
     labels, margin = label_gaussians(explanation, states)
-    return replace(motions, labels=labels, margin=margin, confidence=torch.tensor([m.confidence for m in explanation.motions]))
+    return replace(
+        motions, labels=labels, margin=margin, confidence=torch.tensor([m.confidence for m in explanation.motions])
+    )
 
 
 def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:
-    """With the refined motions every Gaussian chooses its part anew, islands are settled, motions refined again and types settled.
+    """With the refined motions every Gaussian chooses its part anew, islands are settled, motions refined again and
+    types settled.
 
     For up to ``rounds`` rounds, while the energy falls. Returns the motions and what each round measured.
     """
@@ -99,14 +101,26 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
     for number in range(config.rounds if len(motions) else 0):
         lowest, cost = judge(motions)
         best = None
-        # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from here on
+        # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from
+        # here on
         for name in ("kept", "anew"):
             tried = _relabelled(found, states, motions) if name == "anew" else motions
-            labels, count = settle_islands([s.gaussians for s in states], tried.labels, tried.transforms, config.islands)
+            labels, count = settle_islands(
+                [s.gaussians for s in states], tried.labels, tried.transforms, config.islands
+            )
             if all(map(torch.equal, labels, motions.labels)):
                 continue
             value, reached, tried = judge.improved(replace(tried, labels=labels))
-            rounds.append({"round": number, "labels": name, "islands": count, "before": cost, "after": reached, "energy": value - lowest})
+            rounds.append(
+                {
+                    "round": number,
+                    "labels": name,
+                    "islands": count,
+                    "before": cost,
+                    "after": reached,
+                    "energy": value - lowest,
+                }
+            )
             if best is None or value < best[0]:
                 best = (value, tried)
         if best is None or best[0] >= lowest:
@@ -116,10 +130,12 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
 
 
 def drop_unfounded(judge: Judge, motions: PartMotions, least: float) -> tuple[PartMotions, list[dict]]:
-    """Without the parts whose confidence is below ``least``, the least first; labels are chosen anew and motions refined.
+    """Without the parts whose confidence is below ``least``, the least first; labels are chosen anew and motions
+    refined.
 
-    A part that only one state shows has a motion that nothing was observed of: it may explain the other state's photographs a little better
-    (by hiding junk), and is no finding. Returns the motions, and type and confidence of each that went.
+    A part that only one state shows has a motion that nothing was observed of: it may explain the other state's
+    photographs a little better (by hiding junk), and is no finding. Returns the motions, and type and confidence of
+    each that went.
     """
     gone: list[dict] = []
     while len(motions) and float(motions.confidence.min()) < least:

@@ -1,7 +1,9 @@
-"""As many part slots as were asked for: found parts merged where there are more, spare slots beside them where there are fewer.
+"""As many part slots as were asked for: found parts merged where there are more, spare slots beside them where there
+are fewer.
 
-The paper sets K, the number of slots, and asks what a wrong K does (tab:k_ablation, tab:k_sensitivity). Part discovery finds the number
-by itself, so that K would only ever cut its list; ``exact_parts: true`` makes K what it is in the paper.
+The paper sets K, the number of slots, and asks what a wrong K does (tab:k_ablation, tab:k_sensitivity). Part discovery
+finds the number by itself, so that K would only ever cut its list; ``exact_parts: true`` makes K what it is in the
+paper.
 """
 
 from __future__ import annotations
@@ -20,16 +22,21 @@ from p2gs.types import ArticulatedObject
 def merge_to(motions: PartMotions, states: list[StateGaussians], parts: int) -> tuple[PartMotions, list[str]]:
     """The motions with at most ``parts`` - 1 movable parts, and one line for each two that became one.
 
-    Again and again the two parts become one whose joint refit costs least: the squared distance, summed over their solid Gaussians, between
-    where one motion carries them and where their own do. The pair's motion and type are that fit's.
+    Again and again the two parts become one whose joint refit costs least: the squared distance, summed over their
+    solid Gaussians, between where one motion carries them and where their own do. The pair's motion and type are that
+    fit's.
     """
     notes = []
     while len(motions) > max(parts - 1, 1):
         points = [_own_motion(motions, states, k) for k in range(len(motions))]
-        fits = {(a, b): joint_refit(points[a], points[b]) for a in range(len(motions)) for b in range(a + 1, len(motions))}
+        fits = {
+            (a, b): joint_refit(points[a], points[b]) for a in range(len(motions)) for b in range(a + 1, len(motions))
+        }
         (a, b), (cost, kind, T) = min(fits.items(), key=lambda item: item[1][0])
         count = len(points[a][0]) + len(points[b][0])
-        notes.append(f"exact_parts: parts {a + 1} and {b + 1} became one {kind} part; its points are {(cost / count) ** 0.5:.4f} off (rms)")
+        notes.append(
+            f"exact_parts: parts {a + 1} and {b + 1} became one {kind} part; its points are {(cost / count) ** 0.5:.4f} off (rms)"
+        )
         motions = _merged(motions, a, b, kind, T)
     return motions, notes
 
@@ -45,14 +52,18 @@ def _own_motion(motions: PartMotions, states: list[StateGaussians], k: int) -> t
 
 
 def joint_refit(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[float, str, Tensor]:
-    """One joint for two parts: summed squared residual, type, motion [4, 4]. a, b: points [N, 3] at the start and at the end."""
+    """One joint for two parts: summed squared residual, type, motion [4, 4]. a, b: points [N, 3] at the start and at
+    the end."""
     start, end = torch.cat([a[0], b[0]]), torch.cat([a[1], b[1]])
     if len(start) == 0:
         return 0.0, "prismatic", torch.eye(4).double()
     slide = torch.eye(4).double()
     slide[:3, 3] = (end - start).mean(0)
     turn = se3.project_revolute(se3.make(*so3.kabsch(start, end)))
-    fits = [(float((se3.apply(T, start) - end).square().sum()), kind, T) for kind, T in (("prismatic", slide), ("revolute", turn))]
+    fits = [
+        (float((se3.apply(T, start) - end).square().sum()), kind, T)
+        for kind, T in (("prismatic", slide), ("revolute", turn))
+    ]
     return min(fits, key=lambda fit: fit[0])
 
 
@@ -66,12 +77,18 @@ def _merged(motions: PartMotions, a: int, b: int, kind: str, T: Tensor) -> PartM
     confidence[a] = torch.minimum(confidence[a], confidence[b])
     both = motions.with_motion(a, kind, T)
     labels = [number[of] for of in motions.labels]
-    return replace(both, types=[both.types[k] for k in keep], transforms=both.transforms[keep], confidence=confidence[keep], labels=labels)
+    return replace(
+        both,
+        types=[both.types[k] for k in keep],
+        transforms=both.transforms[keep],
+        confidence=confidence[keep],
+        labels=labels,
+    )
 
 
 def add_spare(labels: Tensor, transforms: Tensor, spare: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Labels [N] and transforms [K - 1, 4, 4] with ``spare`` slots more: each begins with an equal share of all Gaussians (N / K of them,
-    drawn at random) and a random screw, as every slot of the paper's own start does."""
+    """Labels [N] and transforms [K - 1, 4, 4] with ``spare`` slots more: each begins with an equal share of all
+    Gaussians (N / K of them, drawn at random) and a random screw, as every slot of the paper's own start does."""
     if spare <= 0:
         return labels, transforms
     known, labels = len(transforms), labels.clone()
@@ -83,9 +100,11 @@ def add_spare(labels: Tensor, transforms: Tensor, spare: int, generator: torch.G
 
 
 def slot_report(learned: Articulation, obj: ArticulatedObject, alive: list[int], found: int) -> list[dict]:
-    """What became of every slot: {slot, spare, share of the Gaussians by argmax, mean probability, part: its id in the twin or null}.
+    """What became of every slot: {slot, spare, share of the Gaussians by argmax, mean probability, part: its id in the
+    twin or null}.
 
-    alive: the slot of each movable part of the twin, in order.  found: movable slots that discovery filled; those after them are spare.
+    alive: the slot of each movable part of the twin, in order.  found: movable slots that discovery filled; those after
+    them are spare.
     """
     labels, total = learned.part_ids, max(len(learned.probs), 1)
     part = {0: 0, **{slot: obj.parts[i + 1].id for i, slot in enumerate(alive)}}

@@ -1,8 +1,8 @@
 """Differentiable rasterization of Gaussians: one function, several backends.
 
-Backends live in their own files and register in ``RASTERIZERS``: ``cpu`` (native kernels), ``gsplat`` (CUDA), ``torch_ref``
-(readable reference in torch, any device and dtype). A backend of your own: ``@RASTERIZERS.register("name")`` on a function from
-``RenderInputs`` to ``RenderOutput``.
+Backends live in their own files and register in ``RASTERIZERS``: ``cpu`` (native kernels), ``gsplat`` (CUDA),
+``torch_ref`` (readable reference in torch, any device and dtype). A backend of your own:
+``@RASTERIZERS.register("name")`` on a function from ``RenderInputs`` to ``RenderOutput``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,15 @@ from p2gs.registry import suggest
 from p2gs.render.base import RASTERIZERS, Rasterizer, RenderInputs, check, split_backend, with_pixels
 from p2gs.types import RenderOutput, UserError
 
-__all__ = ["RASTERIZERS", "RenderInputs", "draws_natively", "find_rasterizer", "rasterize", "rasterize_stored", "with_pixels"]
+__all__ = [
+    "RASTERIZERS",
+    "RenderInputs",
+    "draws_natively",
+    "find_rasterizer",
+    "rasterize",
+    "rasterize_stored",
+    "with_pixels",
+]
 
 _BUILT_IN = ("cpu", "gsplat", "torch_ref")
 _warned: set[str] = set()
@@ -55,7 +63,10 @@ def _auto(means: Tensor) -> str:
         warn_missing_once()
     elif means.device.type not in _warned:
         _warned.add(means.device.type)
-        warnings.warn(f"no fast rasterizer for device '{means.device.type}': using the slow reference rasterizer in torch", stacklevel=3)
+        warnings.warn(
+            f"no fast rasterizer for device '{means.device.type}': using the slow reference rasterizer in torch",
+            stacklevel=3,
+        )
     return "torch_ref"
 
 
@@ -84,22 +95,23 @@ def rasterize(
 ) -> RenderOutput:
     """Splat N Gaussians into one view of ``height`` x ``width`` pixels (Kerbl et al. 2023, doi:10.1145/3592433).
 
-    means [N, 3] world; quats [N, 4] wxyz of any length but zero; scales [N, 3] standard deviations; opacities [N] in 0..1;
-    sh [N, B, 3] with B = 1, 4, 9 or 16; viewmat [4, 4] world -> camera, K [3, 3] in pixels (see ``types``).
+    means [N, 3] world; quats [N, 4] wxyz of any length but zero; scales [N, 3] standard deviations; opacities [N] in
+    0..1; sh [N, B, 3] with B = 1, 4, 9 or 16; viewmat [4, 4] world -> camera, K [3, 3] in pixels (see ``types``).
     sh_degree: use only the bands up to it.  features [N, F], F <= 16: composited like colour, over nothing.
     background [3] or [H, W, 3] (default black).  depth_sq: also accumulate (z - depth_ref)^2.
     near: Gaussians nearer than this (scene units) are culled.  eps2d: variance in pixels^2 added to every projected
-    Gaussian, the pixel's own extent.  antialias: its opacity falls by as much as its area grows by that (Yu et al. 2024, Mip-Splatting,
-    arXiv:2311.16493), so that a surface seen edge-on is as thin as it is. Both None: as ``backend`` has it.
-    absgrad: the backward pass fills ``means2d_abs_grad`` [N] = length of (sum |dL/dx|, sum |dL/dy|) over pixels, pixel units
-    (Ye et al. 2024, arXiv:2404.10484).  median_depth: also give the depth where transmittance passes one half; by default only
-    when no gradient is recorded.  backend: a name in ``RASTERIZERS`` or "auto" (cpu or gsplat by device, else torch_ref), and its pixels:
-    "NAME" or "NAME:classic" is 3DGS (eps2d 0.3), "NAME:sharp" eps2d 0.1 and antialias.
+    Gaussian, the pixel's own extent.  antialias: its opacity falls by as much as its area grows by that (Yu et al.
+    2024, Mip-Splatting, arXiv:2311.16493), so that a surface seen edge-on is as thin as it is. Both None: as
+    ``backend`` has it.
+    absgrad: the backward pass fills ``means2d_abs_grad`` [N] = length of (sum |dL/dx|, sum |dL/dy|) over pixels, pixel
+    units (Ye et al. 2024, arXiv:2404.10484).  median_depth: also give the depth where transmittance passes one half; by
+    default only when no gradient is recorded.  backend: a name in ``RASTERIZERS`` or "auto" (cpu or gsplat by device,
+    else torch_ref), and its pixels: "NAME" or "NAME:classic" is 3DGS (eps2d 0.3), "NAME:sharp" eps2d 0.1 and antialias.
 
-    A Gaussian contributes alpha = min(0.99, opacity exp(-d^T C^-1 d / 2)) where that is at least 1/255; a pixel is finished
-    before its transmittance would fall to 1e-4; colour is max(0, 0.5 + SH(view direction)). A Gaussian with a NaN or infinity in
-    any input is culled and gets zero gradient. Differentiable by means, quats, scales, opacities, sh, features, background and by the first
-    three rows of viewmat, each of their twelve numbers for itself.
+    A Gaussian contributes alpha = min(0.99, opacity exp(-d^T C^-1 d / 2)) where that is at least 1/255; a pixel is
+    finished before its transmittance would fall to 1e-4; colour is max(0, 0.5 + SH(view direction)). A Gaussian with a
+    NaN or infinity in any input is culled and gets zero gradient. Differentiable by means, quats, scales, opacities,
+    sh, features, background and by the first three rows of viewmat, each of their twelve numbers for itself.
 
     Raises ValueError for shapes that do not fit, UserError for a backend that is unknown or cannot run here.
     """
@@ -131,10 +143,12 @@ def rasterize_stored(
     backend: str = "auto",
     **options,
 ) -> RenderOutput:
-    """``rasterize`` of parameters as they are stored: with exp(log_scales) [N, 3], sigmoid(opacity_logits) [N] and joined harmonics.
+    """``rasterize`` of parameters as they are stored: with exp(log_scales) [N, 3], sigmoid(opacity_logits) [N] and
+    joined harmonics.
 
-    sh_rest: None, or [N, B-1, 3] where ``sh`` [N, 1, 3] is the constant band alone. All else as in ``rasterize``, gradients are by what is
-    given. The backend "cpu" reads the parameters themselves; for the others torch makes what they want.
+    sh_rest: None, or [N, B-1, 3] where ``sh`` [N, 1, 3] is the constant band alone. All else as in ``rasterize``,
+    gradients are by what is given. The backend "cpu" reads the parameters themselves; for the others torch makes what
+    they want.
     """
     if sh_rest is not None and sh_rest.shape[1] == 0:
         sh_rest = None

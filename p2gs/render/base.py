@@ -27,12 +27,14 @@ class Pixels:
     antialias: bool
 
 
-# "classic": every 3DGS viewer's. "sharp": a surface seen edge-on is as thin as it is. Gaussians are for the pixels they were fitted with.
+# "classic": every 3DGS viewer's. "sharp": a surface seen edge-on is as thin as it is. Gaussians are for the pixels they
+# were fitted with.
 PIXELS = {"classic": Pixels(0.3, False), "sharp": Pixels(0.1, True)}
 
 
 def split_backend(backend: str) -> tuple[str, Pixels]:
-    """A backend's name and its pixels: "cpu:sharp" -> ("cpu", PIXELS["sharp"]), "cpu" -> ("cpu", PIXELS["classic"]). Raises UserError."""
+    """A backend's name and its pixels: "cpu:sharp" -> ("cpu", PIXELS["sharp"]), "cpu" -> ("cpu", PIXELS["classic"]).
+    Raises UserError."""
     name, _, pixels = backend.partition(":")
     if pixels and pixels not in PIXELS:
         raise UserError(f"rasterizer '{backend}': unknown pixels '{pixels}'{suggest(pixels, PIXELS)}")
@@ -46,7 +48,8 @@ def with_pixels(backend: str, pixels: str) -> str:
 
 @dataclass
 class RenderInputs:
-    """Checked arguments of ``p2gs.render.rasterize`` (see there); ``sh_degree`` is a number, ``median_depth`` decided."""
+    """Checked arguments of ``p2gs.render.rasterize`` (see there); ``sh_degree`` is a number, ``median_depth``
+    decided."""
 
     means: Tensor
     quats: Tensor
@@ -67,7 +70,8 @@ class RenderInputs:
     antialias: bool
     absgrad: bool
     median_depth: bool
-    # ``rasterize_stored``, for the backend "cpu" alone: scales are logarithms and opacities logits, ``sh`` is the constant band
+    # ``rasterize_stored``, for the backend "cpu" alone: scales are logarithms and opacities logits, ``sh`` is the
+    # constant band
     stored: bool = False
     sh_rest: Optional[Tensor] = None
 
@@ -77,7 +81,9 @@ RASTERIZERS: Registry[Rasterizer] = Registry("rasterizer")
 
 
 def _expect(name: str, tensor: Tensor, *shape: Optional[int]) -> None:
-    if tensor.dim() != len(shape) or any(want is not None and want != got for want, got in zip(shape, tensor.shape, strict=True)):
+    if tensor.dim() != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, tensor.shape, strict=True)
+    ):
         wanted = ", ".join("any" if s is None else str(s) for s in shape)
         raise ValueError(f"rasterize: {name} must have shape [{wanted}], got {list(tensor.shape)}")
 
@@ -115,7 +121,9 @@ def check(a: RenderInputs, sh_degree: Optional[int], median_depth: Optional[bool
         if t is not None and t.device != a.means.device:
             raise ValueError(f"rasterize: all tensors must be on one device, got {a.means.device} and {t.device}")
     if median_depth is None:
-        recorded = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (a.means, a.viewmat, *others))
+        recorded = torch.is_grad_enabled() and any(
+            t is not None and t.requires_grad for t in (a.means, a.viewmat, *others)
+        )
         a.median_depth = not recorded
     else:
         a.median_depth = bool(median_depth)

@@ -1,4 +1,5 @@
-"""The native CPU rasterizer (p2gs/native/raster*) behind torch.autograd. Computes in float32 on ``torch.get_num_threads()`` threads."""
+"""The native CPU rasterizer (p2gs/native/raster*) behind torch.autograd. Computes in float32 on
+``torch.get_num_threads()`` threads."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ def _address(t: Optional[Tensor]) -> int:
 
 
 def _forward(a: RenderInputs, keep: bool, means, quats, scales, opacities, sh, features, background, sh_rest):
-    """Renders; returns the native view (needed for backward) and (colour, alpha, depth, depth_sq, features, median, radii)."""
+    """Renders; returns the native view (needed for backward) and (colour, alpha, depth, depth_sq, features, median,
+    radii)."""
     h, w, n = a.height, a.width, means.shape[0]
     colour, alpha, depth = torch.empty(h, w, 3), torch.empty(h, w), torch.empty(h, w)
     depth_sq = torch.empty(h, w) if a.depth_sq else None
@@ -48,7 +50,9 @@ def _forward(a: RenderInputs, keep: bool, means, quats, scales, opacities, sh, f
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, a: RenderInputs, abs_grad, viewmat, means, quats, scales, opacities, sh, features, background, sh_rest):
+    def forward(
+        ctx, a: RenderInputs, abs_grad, viewmat, means, quats, scales, opacities, sh, features, background, sh_rest
+    ):
         ctx.set_materialize_grads(False)
         view, out = _forward(a, True, means, quats, scales, opacities, sh, features, background, sh_rest)
         ctx.view, ctx.abs_grad, ctx.of_camera = view, abs_grad, viewmat.dtype
@@ -72,7 +76,9 @@ class _Rasterize(torch.autograd.Function):
             native_features = torch.empty_like(features)  # pyright: ignore[reportArgumentType]
         v_rest = None if sh_rest is None else torch.empty_like(sh_rest)
         v_view = torch.zeros(4, 4) if ctx.needs_input_grad[2] else None  # its last row is (0, 0, 0, 1) and stays
-        ctx.view.backward([_address(t) for t in (*incoming, *gradients, native_features, ctx.abs_grad, v_rest, v_view)], num_threads())
+        ctx.view.backward(
+            [_address(t) for t in (*incoming, *gradients, native_features, ctx.abs_grad, v_rest, v_view)], num_threads()
+        )
         v_background = None
         if background is not None and ctx.needs_input_grad[9] and colour is not None:
             v_background = (1 - out_alpha)[..., None] * incoming[0]

@@ -1,7 +1,9 @@
-"""The CUDA rasterizer of gsplat (Ye et al. 2024, arXiv:2409.06765; written against 1.5.3). The only file that imports gsplat.
+"""The CUDA rasterizer of gsplat (Ye et al. 2024, arXiv:2409.06765; written against 1.5.3). The only file that imports
+gsplat.
 
-gsplat blends any number of channels per Gaussian, so everything goes through one call: colour (from spherical harmonics in torch,
-so that directions get their gradient), z, (z - depth_ref)^2 and the features. The background is blended here, as it may be an image.
+gsplat blends any number of channels per Gaussian, so everything goes through one call: colour (from spherical harmonics
+in torch, so that directions get their gradient), z, (z - depth_ref)^2 and the features. The background is blended here,
+as it may be an image.
 """
 
 from __future__ import annotations
@@ -17,16 +19,28 @@ from p2gs.types import RenderOutput, UserError
 try:
     from gsplat import rasterization
 except Exception as err:  # besides ImportError: gsplat compiles its kernels on import and may fail in many ways
-    raise UserError(f"the rasterizer 'gsplat' cannot run (pip install 'p2gs[cuda]' on a machine with CUDA): {err}") from err
+    raise UserError(
+        f"the rasterizer 'gsplat' cannot run (pip install 'p2gs[cuda]' on a machine with CUDA): {err}"
+    ) from err
 
 
 def _sane(a: RenderInputs) -> tuple[Tensor, list[Tensor]]:
-    """[N] bool: every input of the Gaussian is finite; and the inputs with an invisible Gaussian in place of each that is not.
+    """[N] bool: every input of the Gaussian is finite; and the inputs with an invisible Gaussian in place of each that
+    is not.
 
     Done before anything else, since a NaN that is masked out later still reaches the gradients as 0 * NaN.
     """
-    given = [a.means, a.quats, a.scales, a.opacities, a.sh[:, : (a.sh_degree + 1) ** 2], *([] if a.features is None else [a.features])]
-    ok = torch.stack([t.detach().flatten(1).isfinite().all(1) if t.dim() > 1 else t.detach().isfinite() for t in given]).all(0)
+    given = [
+        a.means,
+        a.quats,
+        a.scales,
+        a.opacities,
+        a.sh[:, : (a.sh_degree + 1) ** 2],
+        *([] if a.features is None else [a.features]),
+    ]
+    ok = torch.stack(
+        [t.detach().flatten(1).isfinite().all(1) if t.dim() > 1 else t.detach().isfinite() for t in given]
+    ).all(0)
     ok &= (a.quats.detach().square().sum(1) > 0) & (a.opacities.detach() >= ALPHA_MIN)
     fill = (0.0, 1.0, 1.0, 0.0, 0.0, 0.0)
     return ok, [
@@ -37,7 +51,8 @@ def _sane(a: RenderInputs) -> tuple[Tensor, list[Tensor]]:
 
 @RASTERIZERS.register("gsplat")
 def rasterize_gsplat(a: RenderInputs) -> RenderOutput:
-    """See ``p2gs.render.rasterize``. Two differences: no median depth (it is None), and sums are not bit-reproducible."""
+    """See ``p2gs.render.rasterize``. Two differences: no median depth (it is None), and sums are not
+    bit-reproducible."""
     if not a.means.is_cuda:
         raise UserError(f"the rasterizer 'gsplat' renders tensors on a CUDA device, these are on {a.means.device}")
     return through_gsplat(a)

@@ -1,6 +1,8 @@
-"""The reference rasterizer: plain differentiable torch, any device, float32 or float64. Written for reading; the oracle of tests.
+"""The reference rasterizer: plain differentiable torch, any device, float32 or float64. Written for reading; the oracle
+of tests.
 
-Projection follows the EWA approximation (Zwicker et al. 2001, doi:10.1109/VISUAL.2001.964490) as 3DGS and gsplat use it.
+Projection follows the EWA approximation (Zwicker et al. 2001, doi:10.1109/VISUAL.2001.964490) as 3DGS and gsplat use
+it.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ class Splats:
     """Visible Gaussians in the image plane, near ones first. M of them; ``index`` [M] into the N given.
 
     means2d [M, 2] pixels; conics [M, 3]: entries xx, xy, yy of the inverse covariance; opacities [M];
-    values [M, C]: what is accumulated per channel; z [M]; extents [M, 2]: half size of the box where alpha >= 1/255, pixels.
+    values [M, C]: what is accumulated per channel; z [M]; extents [M, 2]: half size of the box where alpha >= 1/255,
+    pixels.
     """
 
     index: Tensor
@@ -86,7 +89,8 @@ def project(a: RenderInputs, dtype: torch.dtype) -> Splats:
     det = cxx * cyy - cxy * cxy
     conics = torch.stack([cyy / det, -cxy / det, cxx / det], -1)
     if a.antialias:
-        area = torch.linalg.cross(P[:, 0], P[:, 1]).square().sum(1)  # det without eps2d; xx yy - xy^2 would cancel for needles
+        # det without eps2d; xx yy - xy^2 would cancel for needles
+        area = torch.linalg.cross(P[:, 0], P[:, 1]).square().sum(1)
         opacities = opacities * (area / det).clamp_min(1e-12).sqrt()
 
     colour = evaluate(sh, normalize(means + W.T @ t, dim=-1), a.sh_degree).clamp_min(0)
@@ -96,14 +100,17 @@ def project(a: RenderInputs, dtype: torch.dtype) -> Splats:
     reach = (2 * torch.log(opacities / ALPHA_MIN)).clamp_min(0).detach().sqrt()
     extents = reach[:, None] * torch.stack([cxx, cyy], -1).detach().sqrt()
     # huge but finite inputs may overflow on the way
-    fine = torch.cat([means2d, cov.flatten(1), conics, colour], 1).isfinite().all(1) & (det > 0) & (opacities >= ALPHA_MIN)
+    fine = (
+        torch.cat([means2d, cov.flatten(1), conics, colour], 1).isfinite().all(1) & (det > 0) & (opacities >= ALPHA_MIN)
+    )
     return Splats(*(s[fine] for s in (index, means2d, conics, opacities, torch.cat(values, 1), z, extents)))
 
 
 def _composite(s: Splats, hit: Tensor, px: Tensor, py: Tensor, abs_sum: Optional[Tensor]):
     """Blend the splats ``hit`` [k], near ones first, at the pixels px, py [p].
 
-    Returns accumulated values [p, C], transmittance [p], median depth [p]. abs_sum [M, 2]: the backward pass adds |dL/dx|, |dL/dy|.
+    Returns accumulated values [p, C], transmittance [p], median depth [p]. abs_sum [M, 2]: the backward pass adds
+    |dL/dx|, |dL/dy|.
     """
     dx = px[None] - s.means2d[hit, 0, None]
     dy = py[None] - s.means2d[hit, 1, None]
@@ -134,7 +141,10 @@ def rasterize_torch(a: RenderInputs) -> RenderOutput:
 
     abs_grad = abs_sum = None
     if a.absgrad:
-        abs_grad, abs_sum = torch.zeros(n, device=device, dtype=dtype), torch.zeros(len(s.index), 2, device=device, dtype=dtype)
+        abs_grad, abs_sum = (
+            torch.zeros(n, device=device, dtype=dtype),
+            torch.zeros(len(s.index), 2, device=device, dtype=dtype),
+        )
         if s.means2d.requires_grad:  # runs when the gradients of all tiles are in
 
             def finish(_: Tensor) -> None:

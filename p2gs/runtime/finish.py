@@ -41,7 +41,6 @@ class FinishStage(Stage):
         from p2gs.diagnosis.measures import StageResults
         from p2gs.diagnosis.page import write_diagnosis
         from p2gs.export.run_folder import complete_run, write_twin
-        from p2gs.surface.contents import in_trays
 
         config, found_in, states = section.config, states, sharpened or states
         backend = {"backend": run.backend, "twin_backend": run.rasterizer, "device": run.device}
@@ -54,7 +53,6 @@ class FinishStage(Stage):
             run.scene.similarity,
             losses,
             seed=run.seed,
-            contents=in_trays,
             **backend,
         )
         for note in notes:

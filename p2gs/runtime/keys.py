@@ -52,8 +52,8 @@ class StageKeys:
         return self._parts[name]
 
     def deciding(self, name: str) -> list[str]:
-        """The phase and those before it that it builds on, directly or not, in their order: they hand over what it needs
-        or uses, or change the scene."""
+        """The phase and those before it that it builds on, directly or not, in their order: they hand over what it
+        needs or uses, or change the scene."""
         wanted = [stage for stage, phase in self.order.items() if phase.wanted(self.run)]
         before = wanted[: wanted.index(name)] if name in wanted else wanted
         phase, found = self.order[name], {name}

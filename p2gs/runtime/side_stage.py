@@ -1,7 +1,7 @@
 """One training stage of a run in a process of its own, beside the run.
 
-The two single states need nothing of each other, and two processes of one thread each train them faster than one process of two
-threads trains one after the other. ``p2gs.runtime.side_worker`` is what that process runs.
+The two single states need nothing of each other, and two processes of one thread each train them faster than one
+process of two threads trains one after the other. ``p2gs.runtime.side_worker`` is what that process runs.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ PATIENCE = 60.0  # seconds to save the state in
 
 
 def can_run_beside(cfg: RunConfig, device: torch.device, phase: str = "single_state") -> bool:
-    """Whether both states' runs of a phase can be trained at once: on a CPU, with two threads or more, nothing that wants a run for itself.
+    """Whether both states' runs of a phase can be trained at once: on a CPU, with two threads or more, nothing that
+    wants a run for itself.
 
-    A loss or callback that the running program registered itself (no plugin) is unknown to another process: then one after the other.
+    A loss or callback that the running program registered itself (no plugin) is unknown to another process: then one
+    after the other.
     """
     section = cfg.phases[phase]
     callbacks = section.new_callbacks().values()
@@ -40,7 +42,8 @@ def can_run_beside(cfg: RunConfig, device: torch.device, phase: str = "single_st
 
 
 class SideStage:
-    """A stage that runs in another process; its lines come out among ours. Use as a context: leaving it stops what still runs."""
+    """A stage that runs in another process; its lines come out among ours. Use as a context: leaving it stops what
+    still runs."""
 
     def __init__(self, run_dir: Path, stage: str, threads: int):
         self.stage, self.began, self.seconds = stage, time.perf_counter(), 0.0
@@ -80,7 +83,8 @@ class SideStage:
             self.process.wait()
 
     def wait(self) -> float:
-        """Until the stage is done; returns its seconds. Raises UserError for a user's mistake and when the process was lost."""
+        """Until the stage is done; returns its seconds. Raises UserError for a user's mistake and when the process was
+        lost."""
         self.process.wait()
         self.reader.join()
         code = self.process.returncode

@@ -1,5 +1,5 @@
-"""``python -m p2gs.runtime.side_worker RUN STAGE THREADS``: one training stage in the process that ``side_stage`` starts beside
-a run.
+"""``python -m p2gs.runtime.side_worker RUN STAGE THREADS``: one training stage in the process that ``side_stage``
+starts beside a run.
 
 It reads RUN/config.yaml, leaves RUN/checkpoints/STAGE.pt, and stops, its state saved, when the pipe to its parent
 closes.

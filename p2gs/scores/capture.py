@@ -1,7 +1,8 @@
 """Scores of a captured scene's run in true metres: ``p2gs test RUN --truth DIR``.
 
-The capture has a frame and a unit of its own. Its registered start cameras, matched to the true ones through ``capture.json``, give the
-similarity to the true world; what is left of the end cameras after it is the states' misalignment.
+The capture has a frame and a unit of its own. Its registered start cameras, matched to the true ones through
+``capture.json``, give the similarity to the true world; what is left of the end cameras after it is the states'
+misalignment.
 """
 
 from __future__ import annotations

@@ -1,16 +1,20 @@
-"""Scores of a finished run: joints, surfaces and pictures against what the scene has. The only command that opens ground truth.
+"""Scores of a finished run: joints, surfaces and pictures against what the scene has. The only command that opens
+ground truth.
 
-``RUN/metrics.json`` (format p2gs-metrics/1), every length in input units, missing things left out and told in ``missing``:
+``RUN/metrics.json`` (format p2gs-metrics/1), every length in input units, missing things left out and told in
+``missing``:
 
     scene, num_parts, gaussians            name of the scene; counts of the twin
     parts        [{id, gaussians}]
-    joints       {joints: [{gt, type, pred, pred_type, errors: {axis_angle, axis_position, motion} | null}], failures, extra, ...means}:
+    joints       {joints: [{gt, type, pred, pred_type, errors: {axis_angle, axis_position, motion} | null}], failures,
+    extra, ...means}:
                  see metrics.joints.JointReport (axis_angle degrees, axis_position x10, motion degrees or length)
-    views        {start, end, mean}: {split, count, psnr_white, psnr_black, ssim_white, ssim_black, psnr_masked, lpips (over white;
+    views        {start, end, mean}: {split, count, psnr_white, psnr_black, ssim_white, ssim_black, psnr_masked, lpips
+    (over white;
                  only with torchvision and its AlexNet weights at hand, see metrics.lpips), alpha_error,
-                 depth_median, depth_p90, depth_bad}: photographs that the fit did not train on where there are any; psnr_masked over
-                 the object's pixels only, alpha_error mean |alpha - mask|, depth_* of |expected depth - true| on the object,
-                 depth_bad the fraction off by more than 1 % of the object's diagonal
+                 depth_median, depth_p90, depth_bad}: photographs that the fit did not train on where there are any;
+                 psnr_masked over the object's pixels only, alpha_error mean |alpha - mask|, depth_* of |expected depth
+                 - true| on the object, depth_bad the fraction off by more than 1 % of the object's diagonal
     chamfer      {static|movable|whole: {value, floor}, parts, failures}: x1000, see metrics.chamfer.ChamferReport
     penetration  {mean, max}: fraction of the moving Gaussians inside the base, over five states
     slots        with exact_parts: what became of every part slot, see models.slots.slot_report
@@ -49,8 +53,8 @@ STATES = ("start", "end")
 def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict:
     """Score a run, write RUN/metrics.json and return what it holds.
 
-    root: the scene's folder where it has moved since the fit. Raises UserError when the run is not finished or the scene's
-    photographs cannot be read; a scene without ground truth is scored by its photographs alone.
+    root: the scene's folder where it has moved since the fit. Raises UserError when the run is not finished or the
+    scene's photographs cannot be read; a scene without ground truth is scored by its photographs alone.
     """
     began = time.perf_counter()
     run_dir = Path(run_dir)
@@ -97,7 +101,11 @@ def open_scene(run_dir: Path, root: Optional[Path | str] = None):
     cfg = load_config([str(path)], [] if root is None else ["--data.root", str(root)])
     scene = cfg.data.raw_scene()
     folder, name = getattr(cfg.data, "root", None), cfg.data_options["format"]
-    truth = None if folder is None else load_ground_truth(folder, name if name in LAYOUTS else None, cfg.data_options.get("source"))
+    truth = (
+        None
+        if folder is None
+        else load_ground_truth(folder, name if name in LAYOUTS else None, cfg.data_options.get("source"))
+    )
     return as_fitted(scene, run_dir), truth
 
 
@@ -137,7 +145,9 @@ def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]
     return out
 
 
-def surface_scores(run_dir: Path, truth: "GroundTruth", assignment: dict[int, int], missing: list[str]) -> Optional[dict]:
+def surface_scores(
+    run_dir: Path, truth: "GroundTruth", assignment: dict[int, int], missing: list[str]
+) -> Optional[dict]:
     """Chamfer distances of RUN/meshes against the ground truth's; None where either is missing."""
     from p2gs.metrics.chamfer import PartMeshes, read_part_meshes
 
@@ -151,7 +161,9 @@ def surface_scores(run_dir: Path, truth: "GroundTruth", assignment: dict[int, in
             missing.append(f"the ground truth has no meshes of the {name} state's parts")
             return None
         whole_apart = surface_options(run_dir).whole == "separate"
-        pred[name] = PartMeshes(made[0], made[1:], read_mesh(Path(run_dir) / "meshes" / name / "whole.ply") if whole_apart else None)
+        pred[name] = PartMeshes(
+            made[0], made[1:], read_mesh(Path(run_dir) / "meshes" / name / "whole.ply") if whole_apart else None
+        )
         gt[name] = read_part_meshes(true.whole, true.static, true.dynamic)
     chamfer = PartChamfer()
     chamfer.update(pred, gt, assignment)

@@ -10,7 +10,15 @@ def score_tables(metrics: dict) -> Any:
     from rich.console import Group
 
     items = [f"[bold]{metrics['scene']}[/]: {metrics['num_parts']} parts, {metrics['gaussians']:,} Gaussians"]
-    items += [t for t in (joint_table(metrics.get("joints")), chamfer_table(metrics.get("chamfer")), view_table(metrics.get("views"))) if t]
+    items += [
+        t
+        for t in (
+            joint_table(metrics.get("joints")),
+            chamfer_table(metrics.get("chamfer")),
+            view_table(metrics.get("views")),
+        )
+        if t
+    ]
     items += [f"[dim]missing: {text}[/]" for text in metrics["missing"]]
     return Group(*items)
 
@@ -26,7 +34,9 @@ def joint_table(joints: Optional[dict]) -> Any:
             why = "not found" if j["pred"] is None else f"found as {j['pred_type']}"
             table.add_row(str(j["gt"] + 1), f"{j['type']} ({why})", "F", "F", "F", style="red")
         else:
-            table.add_row(str(j["gt"] + 1), j["type"], _num(e["axis_angle"]), _num(e["axis_position"]), _num(e["motion"]))
+            table.add_row(
+                str(j["gt"] + 1), j["type"], _num(e["axis_angle"]), _num(e["axis_position"]), _num(e["motion"])
+            )
     table.add_section()
     mean = [joints["axis_angle_mean"], joints["pos_mean_revolute"], joints["motion_mean"]]
     table.add_row("mean", f"{joints['failures']} failed, {len(joints['extra'])} extra", *map(_num, mean))
@@ -51,7 +61,10 @@ def view_table(views: Optional[dict]) -> Any:
     more = (["LPIPS"] if perceived else []) + (["depth median", "depth p90"] if depth else [])
     table = _table("views", "", "PSNR white", "PSNR black", "SSIM white", "PSNR object", *more)
     for name, v in views.items():
-        cells = [_num(v.get(k), 2) for k in ("psnr_white", "psnr_black")] + [_num(v.get("ssim_white")), _num(v.get("psnr_masked"), 2)]
+        cells = [_num(v.get(k), 2) for k in ("psnr_white", "psnr_black")] + [
+            _num(v.get("ssim_white")),
+            _num(v.get("psnr_masked"), 2),
+        ]
         cells += [_num(v.get("lpips"))] if perceived else []
         cells += [_num(v.get(k), 4) for k in ("depth_median", "depth_p90")] if depth else []
         table.add_row(name, f"{v['count']} {v['split']}" if "count" in v else "", *cells)

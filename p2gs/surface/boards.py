@@ -1,8 +1,9 @@
 """Boards inside: flat surfaces across the coordinate axes that photographs through an opening agree on.
 
-Shelves, partitions, the bottoms of drawers. Where rays of many photographs meet what is there, the colours that fall on one place agree;
-before and behind it they do not. Dim and noisy insides tell so little of any one place that training does not find it, but a whole plane is
-unmistakable (plane sweeping, https://doi.org/10.1109/CVPR.1996.517097). Not in the paper.
+Shelves, partitions, the bottoms of drawers. Where rays of many photographs meet what is there, the colours that fall on
+one place agree; before and behind it they do not. Dim and noisy insides tell so little of any one place that training
+does not find it, but a whole plane is unmistakable (plane sweeping, https://doi.org/10.1109/CVPR.1996.517097). Not in
+the paper.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ MOST = 6  # boards
 
 @dataclass
 class Rays:
-    """Rays of photographs into an opening.  start [R, 3], unit way [R, 3], far [R]: the distance at which they end, all float64; colour
-    [R, 3]; patch [R]: the one they pass."""
+    """Rays of photographs into an opening.  start [R, 3], unit way [R, 3], far [R]: the distance at which they end, all
+    float64; colour [R, 3]; patch [R]: the one they pass."""
 
     start: Tensor
     way: Tensor
@@ -39,8 +40,8 @@ class Rays:
 
 @dataclass
 class Board:
-    """A part of a plane across a coordinate axis.  axis: 0, 1 or 2; offset: along it; lo [2]: where its ``mask`` [A, B] bool, of cells,
-    begins along the next two."""
+    """A part of a plane across a coordinate axis.  axis: 0, 1 or 2; offset: along it; lo [2]: where its ``mask`` [A, B]
+    bool, of cells, begins along the next two."""
 
     axis: int
     offset: float
@@ -67,11 +68,14 @@ class Board:
 
 
 def disagreement(cells: Tensor, colours: Tensor) -> Tensor:
-    """Variance of the colours [R, 3] that fall on one cell [R] int64, [R] float64; nan where it is the only one there."""
+    """Variance of the colours [R, 3] that fall on one cell [R] int64, [R] float64; nan where it is the only one
+    there."""
     where = torch.unique(cells, return_inverse=True)[1]
     n = torch.bincount(where).double()
     colours = colours.double()
-    mean, square = (torch.zeros(len(n), 3, dtype=torch.float64).index_add_(0, where, c) / n[:, None] for c in (colours, colours**2))
+    mean, square = (
+        torch.zeros(len(n), 3, dtype=torch.float64).index_add_(0, where, c) / n[:, None] for c in (colours, colours**2)
+    )
     return ((square - mean**2).sum(1) * n / (n - 1))[where]
 
 
@@ -80,18 +84,20 @@ def _others(axis: int) -> list[int]:
 
 
 def find_boards(rays: Rays, lo: Tensor, hi: Tensor, near: float, stay: bool) -> list[Board]:
-    """Boards on which the colours of rays [R] (float64) agree better than where they end; best first, and each one ends those that meet it
-    before the next is looked for.
+    """Boards on which the colours of rays [R] (float64) agree better than where they end; best first, and each one ends
+    those that meet it before the next is looked for.
 
-    lo, hi [3]: the box in which they are looked for.  near: how far behind the rays' start the first may be.  stay: where the rays of a
-    patch agree better at their start than at their end, only what is better than that counts.
+    lo, hi [3]: the box in which they are looked for.  near: how far behind the rays' start the first may be.  stay:
+    where the rays of a patch agree better at their start than at their end, only what is better than that counts.
     """
     if len(rays.far) < FEW:
         return []
     rays = rays[torch.linspace(0, len(rays.far) - 1, min(len(rays.far), ENOUGH)).long()]
     size = ((hi - lo) / CELL).ceil().long().clamp_min(1).tolist()
     others = [_others(i) for i in range(3)]
-    planes = [Board(i, 0.0, lo[others[i]], torch.ones([size[j] for j in others[i]], dtype=torch.bool)) for i in range(3)]
+    planes = [
+        Board(i, 0.0, lo[others[i]], torch.ones([size[j] for j in others[i]], dtype=torch.bool)) for i in range(3)
+    ]
 
     def at(points: Tensor) -> Tensor:
         a, b, c = ((points - lo) / CELL).floor().long().unbind(1)
@@ -106,7 +112,11 @@ def find_boards(rays: Rays, lo: Tensor, hi: Tensor, near: float, stay: bool) -> 
         now = torch.where((sums[0] < sums[1])[rays.patch], before, now)
     boards: list[Board] = []
     while len(boards) < MOST:
-        tried = (replace(planes[i], offset=float(c)) for i in range(3) for c in torch.arange(float(lo[i]), float(hi[i]), STEP))
+        tried = (
+            replace(planes[i], offset=float(c))
+            for i in range(3)
+            for c in torch.arange(float(lo[i]), float(hi[i]), STEP)
+        )
         best = max(tried, key=partial(_gain, rays=rays, now=now, near=near))
         finer = (replace(best, offset=best.offset + k * FINE) for k in range(-3, 4))
         best = max(finer, key=partial(_gain, rays=rays, now=now, near=near))

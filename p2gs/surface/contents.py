@@ -1,7 +1,8 @@
 """What is in a drawer goes with it: labels of the Gaussians on and in trays that stand open.
 
-A side of an opened drawer may be labelled as a door's, for the door's motion happens to lay it on some surface of the other state. Once
-the parts' surfaces are there they tell where an open drawer's tray is, and that no other part can be there. Not in the paper.
+A side of an opened drawer may be labelled as a door's, for the door's motion happens to lay it on some surface of the
+other state. Once the parts' surfaces are there they tell where an open drawer's tray is, and that no other part can be
+there. Not in the paper.
 """
 
 from __future__ import annotations
@@ -33,27 +34,35 @@ def belongs(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
 
 
 def in_mouth(within: np.ndarray, tray: Tray, near: float) -> np.ndarray:
-    """Which points, so far ``within`` [N, 6] a tray's sides, are in its mouth or before it, away from the other sides, [N] bool."""
+    """Which points, so far ``within`` [N, 6] a tray's sides, are in its mouth or before it, away from the other sides,
+    [N] bool."""
     return (within[:, tray.mouth_side] < 2 * near) & (np.delete(within, tray.mouth_side, 1) > near).all(1)
 
 
 def beside(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
-    """Which points [N, 3], in a tray's axes, are where its front was or passed before the drawer was open, but for its mouth, [N] bool: no
-    other moving part can be there."""
+    """Which points [N, 3], in a tray's axes, are where its front was or passed before the drawer was open, but for its
+    mouth, [N] bool: no other moving part can be there."""
     front, within = tray.front, tray.within(points)
-    passed = ((points[:, 1:] > front.lo) & (points[:, 1:] < front.hi)).all(1) & (points[:, 0] < front.back) & out_of_body(points, tray, 0)
+    passed = (
+        ((points[:, 1:] > front.lo) & (points[:, 1:] < front.hi)).all(1)
+        & (points[:, 0] < front.back)
+        & out_of_body(points, tray, 0)
+    )
     return passed & (within[:, tray.mouth_side] > -near) & ~in_mouth(within, tray, near)
 
 
 def out_of_body(points: np.ndarray, tray: Tray, near: float) -> np.ndarray:
-    """Which points [N, 3], in a tray's axes, are by more than ``near`` before what the drawer slides out of, while it is open, [N] bool."""
+    """Which points [N, 3], in a tray's axes, are by more than ``near`` before what the drawer slides out of, while it
+    is open, [N] bool."""
     return points[:, 0] > tray.front.back - tray.travel + near
 
 
 @torch.no_grad()
-def in_trays(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], backend: str = "auto") -> tuple[Tensor, Tensor]:
-    """Labels [N] of a twin's Gaussians, those in or on a tray that stands open its own (of the base's only what is out of the body); and
-    which are so their drawer's now, [N] bool.
+def in_trays(
+    obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], backend: str = "auto"
+) -> tuple[Tensor, Tensor]:
+    """Labels [N] of a twin's Gaussians, those in or on a tray that stands open its own (of the base's only what is out
+    of the body); and which are so their drawer's now, [N] bool.
 
     obj and cameras ((state, camera) pairs) in one coordinate system; parts have their places as ids, the base 0.
     """

@@ -16,15 +16,18 @@ from p2gs.types import Camera
 class DepthView:
     """What one view saw.
 
-    depth [H, W] along z, 0 where nothing was hit.  labels [H, W] int64 part id, -1 where nothing.  colour [H, W, 3] in 0..1.
+    depth [H, W] along z, 0 where nothing was hit.  labels [H, W] int64 part id, -1 where nothing.  colour [H, W, 3] in
+    0..1.
     """
 
     camera: Camera
     depth: Tensor
     labels: Tensor
     colour: Tensor
-    normal_dot: Optional[Tensor] = None  # [H, W] |n . ray| for a ray of unit z; distance to the surface's plane per unit of depth
-    cosine: Optional[Tensor] = None  # [H, W] weight of the sighting: between ray and normal, 0 where the depth has an edge
+    # [H, W] |n . ray| for a ray of unit z; distance to the surface's plane per unit of depth
+    normal_dot: Optional[Tensor] = None
+    # [H, W] weight of the sighting: between ray and normal, 0 where the depth has an edge
+    cosine: Optional[Tensor] = None
 
 
 def camera_rays(camera: Camera) -> Tensor:
@@ -40,19 +43,26 @@ def _rays(K: tuple[float, ...], width: int, height: int) -> Tensor:
 
 
 def add_normals(view: DepthView, edge: float) -> DepthView:
-    """Fill ``normal_dot`` and ``cosine`` from the depth map. edge: neighbours further apart in depth than this are another surface."""
+    """Fill ``normal_dot`` and ``cosine`` from the depth map. edge: neighbours further apart in depth than this are
+    another surface."""
     rays = camera_rays(view.camera)
     p, d = rays * view.depth[..., None], view.depth
     pad = torch.nn.functional.pad(p.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0].permute(1, 2, 0)
     dx, dy = pad[1:-1, 2:] - pad[1:-1, :-2], pad[2:, 1:-1] - pad[:-2, 1:-1]
     n = torch.nn.functional.normalize(torch.linalg.cross(dx, dy), dim=-1)
     dot = (n * rays).sum(-1).abs()
-    # a plane seen at an angle changes depth too: an edge is where both neighbours are off the straight line between them
+    # a plane seen at an angle changes depth too: an edge is where both neighbours are off the straight line between
+    # them
     near = torch.nn.functional.pad(d[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    bend = torch.maximum((near[1:-1, 2:] + near[1:-1, :-2] - 2 * d).abs(), (near[2:, 1:-1] + near[:-2, 1:-1] - 2 * d).abs())
+    bend = torch.maximum(
+        (near[1:-1, 2:] + near[1:-1, :-2] - 2 * d).abs(), (near[2:, 1:-1] + near[:-2, 1:-1] - 2 * d).abs()
+    )
     hole = (near[1:-1, 2:] == 0) | (near[1:-1, :-2] == 0) | (near[2:, 1:-1] == 0) | (near[:-2, 1:-1] == 0)
     cosine = dot / rays.norm(dim=-1)
-    view.normal_dot, view.cosine = dot, torch.where((bend > edge) | hole | (d == 0) | (cosine < 0.1), torch.zeros_like(dot), cosine)
+    view.normal_dot, view.cosine = (
+        dot,
+        torch.where((bend > edge) | hole | (d == 0) | (cosine < 0.1), torch.zeros_like(dot), cosine),
+    )
     return view
 
 

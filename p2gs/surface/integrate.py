@@ -11,28 +11,36 @@ from p2gs.native import native, num_threads
 from p2gs.surface.depth_view import DepthView, pixels
 
 CHUNK = 1 << 16  # voxels
-FREE_WEIGHT = 0.3  # of a view that sees through a voxel, against 1 of a view that sees surface in it head-on and for sure
+# of a view that sees through a voxel, against 1 of a view that sees surface in it head-on and for sure
+FREE_WEIGHT = 0.3
 
 
 def integrate(
     points: Tensor, views: Sequence[DepthView], matrices: Sequence[Tensor], part: int, trunc: float, behind: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Signed distance in units of trunc [n], weight of surface sightings [n] and colour [n, 3] at points [n, 3] float32.
+    """Signed distance in units of trunc [n], weight of surface sightings [n] and colour [n, 3] at points [n, 3]
+    float32.
 
-    views: with normals, float32 maps and int64 labels, all on the CPU.  matrices: ``pixel_matrix`` of each.  part: in ``views``.
-    trunc: distance in front of the surface at which space counts as free.  behind: how far behind the surface it still counts.
-    The same bits for any number of threads.  Raises ValueError for a view without normals or with maps of other shapes than its camera's.
+    views: with normals, float32 maps and int64 labels, all on the CPU.  matrices: ``pixel_matrix`` of each.  part: in
+    ``views``.
+    trunc: distance in front of the surface at which space counts as free.  behind: how far behind the surface it still
+    counts. The same bits for any number of threads.  Raises ValueError for a view without normals or with maps of other
+    shapes than its camera's.
     """
     for view in views:
         shape = (view.camera.height, view.camera.width)
         maps = (view.depth, view.labels, view.normal_dot, view.cosine, view.colour)
         if any(m is None for m in maps) or any(m.shape[:2] != shape for m in maps):
-            raise ValueError(f"a view of {shape[1]} x {shape[0]} pixels wants depth, labels, normal_dot, cosine and colour of that size")
+            raise ValueError(
+                f"a view of {shape[1]} x {shape[0]} pixels wants depth, labels, normal_dot, cosine and colour of that size"
+            )
     if native is None:
         return integrate_reference(points, views, matrices, part, trunc, behind)
     kept, rows = [], []  # copies, where a view's maps are not contiguous, must outlive the call
     for view in views:
-        depth, dot, cosine, colour = (m.float().contiguous() for m in (view.depth, view.normal_dot, view.cosine, view.colour))
+        depth, dot, cosine, colour = (
+            m.float().contiguous() for m in (view.depth, view.normal_dot, view.cosine, view.colour)
+        )
         kept.append((depth, view.labels.long().contiguous(), dot, cosine, colour))
         rows.append([m.data_ptr() for m in kept[-1]] + [view.camera.width, view.camera.height])
     points, n = points.float().contiguous(), len(points)
@@ -40,7 +48,9 @@ def integrate(
     table = torch.tensor(rows, dtype=torch.int64).reshape(-1, 7)
     lines = torch.stack(list(matrices)).float().contiguous() if len(rows) else torch.zeros(0, 3, 4)
     limits, addresses = [trunc, behind, FREE_WEIGHT], [t.data_ptr() for t in out]
-    native.fuse_views(table.data_ptr(), lines.data_ptr(), len(rows), part, limits, points.data_ptr(), n, addresses, num_threads())
+    native.fuse_views(
+        table.data_ptr(), lines.data_ptr(), len(rows), part, limits, points.data_ptr(), n, addresses, num_threads()
+    )
     return tuple(out)
 
 
@@ -51,14 +61,19 @@ def integrate_reference(
     maps = [_pixel_table(v, part).to(points) for v in views]
     matrices = [M.to(points) for M in matrices]
     chunks = points.split(CHUNK)  # small enough to stay in cache through all views
-    return tuple(torch.cat(x) for x in zip(*(_chunk(x, views, maps, matrices, trunc, behind) for x in chunks), strict=True))
+    return tuple(
+        torch.cat(x) for x in zip(*(_chunk(x, views, maps, matrices, trunc, behind) for x in chunks), strict=True)
+    )
 
 
 def _pixel_table(view: DepthView, part: int) -> Tensor:
-    """[H W + 1, 6] float32 a pixel: depth (1e9 where nothing is), |n . ray|, cosine on this part (else 0), RGB. The last row: outside."""
+    """[H W + 1, 6] float32 a pixel: depth (1e9 where nothing is), |n . ray|, cosine on this part (else 0), RGB. The
+    last row: outside."""
     depth = torch.where(view.labels < 0, torch.full_like(view.depth, 1e9), view.depth)
     cosine = torch.where(view.labels == part, view.cosine, torch.zeros_like(view.cosine))
-    table = torch.cat([depth[..., None], view.normal_dot.clamp_min(0.05)[..., None], cosine[..., None], view.colour], -1).reshape(-1, 6)
+    table = torch.cat(
+        [depth[..., None], view.normal_dot.clamp_min(0.05)[..., None], cosine[..., None], view.colour], -1
+    ).reshape(-1, 6)
     return torch.cat([table, torch.tensor([[-1e9, 1.0, 0, 0, 0, 0]])])
 
 

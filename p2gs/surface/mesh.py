@@ -24,8 +24,11 @@ STATES = ("start", "end")
 VIEWS = 64  # a state
 
 
-def mesh_cameras(obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: int = VIEWS) -> list[tuple[int, Camera]]:
-    """(state, camera) to look from: the training views, at most ``count`` a state evenly taken; an orbit where there are none."""
+def mesh_cameras(
+    obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: int = VIEWS
+) -> list[tuple[int, Camera]]:
+    """(state, camera) to look from: the training views, at most ``count`` a state evenly taken; an orbit where there
+    are none."""
     out = []
     for state in (0, 1):
         mine = [c.camera for c in cameras if c.state == state and c.split == "train"]
@@ -39,12 +42,13 @@ def mesh_cameras(obj: ArticulatedObject, cameras: Sequence[NamedCamera], count: 
 def part_meshes(
     obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION, complete: bool = True
 ) -> list[Mesh]:
-    """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.  The base's
-    underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``), with nothing of
-    the base left in their way (``clear_way``) or of other parts on them (``not_the_trays``), and pieces of what slides joined
-    (``join_pieces``).
+    """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.
+    The base's underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed
+    (``complete_tray``), with nothing of the base left in their way (``clear_way``) or of other parts on them
+    (``not_the_trays``), and pieces of what slides joined (``join_pieces``).
 
-    obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the object.
+    obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the
+    object.
     complete: off, there is only what was seen.
     """
     seen = sight(obj, cameras, resolution)
@@ -76,8 +80,8 @@ def part_meshes(
 def write_meshes(run_dir: Path | str, resolution: int = RESOLUTION, log=None) -> dict[str, list[Path]]:
     """RUN/meshes/{start,end}/{part_<id>,whole}.ply with vertex colours, input coordinates. Returns the paths by state.
 
-    The whole is its parts joined, so that it has the surfaces that only the other state shows, unless RUN/config.yaml wants another
-    protocol (``protocol.SurfaceOptions``). Raises UserError without a twin.
+    The whole is its parts joined, so that it has the surfaces that only the other state shows, unless RUN/config.yaml
+    wants another protocol (``protocol.SurfaceOptions``). Raises UserError without a twin.
     """
     run_dir = Path(run_dir)
     began = time.perf_counter()
@@ -124,7 +128,12 @@ def write_mesh(path: Path, mesh: Mesh) -> Path:
     for i, name in enumerate(("red", "green", "blue")):
         vertices[name] = mesh.colours[:, i]
     faces["n"], faces["v"] = 3, mesh.faces
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}", *(f"property float {n}" for n in "xyz")]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property float {n}" for n in "xyz"),
+    ]
     lines += [f"property uchar {n}" for n in ("red", "green", "blue")]
     lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
     path.write_bytes(("\n".join(lines) + "\n").encode() + vertices.tobytes() + faces.tobytes())
@@ -142,6 +151,8 @@ def read_mesh(path: Path) -> Mesh:
         if min(counts) < 0 or (len(faces) and (faces["v"].min() < 0 or faces["v"].max() >= len(vertices))):
             raise ValueError("a face has a vertex that is not there")
     except (ValueError, IndexError, OverflowError) as err:
-        raise UserError(f"{path} is no mesh of p2gs, or is cut short ({err}); p2gs export RUN --format ply writes it anew") from err
+        raise UserError(
+            f"{path} is no mesh of p2gs, or is cut short ({err}); p2gs export RUN --format ply writes it anew"
+        ) from err
     xyz, rgb = (np.stack([vertices[n] for n in names], 1) for names in (("x", "y", "z"), ("red", "green", "blue")))
     return Mesh(xyz.astype(np.float64), faces["v"].astype(np.int64), rgb)

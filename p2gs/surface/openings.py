@@ -1,9 +1,10 @@
-"""The room behind an opening: what nothing fixes in depth gives way to the walls behind it, where the photographs allow it.
+"""The room behind an opening: what nothing fixes in depth gives way to the walls behind it, where the photographs allow
+it.
 
-A dim, noisy inside tells photographs next to nothing of its depth. Training closes the opening with a lid, often as far out as the free
-edges of the open doors, where the other state sees empty space: it cannot be the base's then, is labelled a door's, and swings with it.
-Made things are hollow: unless pictures say otherwise, a view into an opening ends at the inner side of the walls that are known from
-outside. Not in the paper.
+A dim, noisy inside tells photographs next to nothing of its depth. Training closes the opening with a lid, often as far
+out as the free edges of the open doors, where the other state sees empty space: it cannot be the base's then, is
+labelled a door's, and swings with it. Made things are hollow: unless pictures say otherwise, a view into an opening
+ends at the inner side of the walls that are known from outside. Not in the paper.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from typing import Callable
 import torch
 from torch import Tensor
 
+from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.models.single_state import render_gaussians
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
 from p2gs.parts.islands import find_islands
@@ -29,7 +30,8 @@ from p2gs.visibility.evidence import render_depths
 from p2gs.visibility.free_space import SURFACE, landed, out_of_sight
 
 SOLID = 0.3  # opacity from which a Gaussian is surface
-ALIKE = 0.9  # share of the most Gaussians that any backdrop lets give way from which on backdrops are held against the photographs
+# share of the most Gaussians that any backdrop lets give way from which on backdrops are held against the photographs
+ALIKE = 0.9
 APART = 0.25  # share of a part's largest piece below which another one is apart from it
 COVER = 5.0  # pixels, all checked views together, that a patch must cover to be judged
 
@@ -38,13 +40,16 @@ COVER = 5.0  # pixels, all checked views together, that a patch must cover to be
 class OpeningsConfig:
     """Options of the room behind openings.
 
-    may_lose: patches of the base give way where the image error over each of them rises to no more than this times what it was; 0 = off.
-    doors: the same for patches of turning parts, which hardly have insides that go with them, and for pieces that hang apart from their
-    part. drawers: for patches of sliding parts, which have such insides. rest: at least this for patches most of whose neighbours gave way.
-    boards: whether flat boards inside (shelves, partitions, bottoms of drawers) are looked for, before which walls are not seen.
-    patch: Gaussians a patch. looks, checks: views of a state from which rays are cast, and by which patches are judged; size: their
-    long edge in pixels. apart: surfaces that the other state shows within this are confirmed by it; cell: grid of the walls; wall: their
-    thickness (all internal units).
+    may_lose: patches of the base give way where the image error over each of them rises to no more than this times what
+    it was; 0 = off.
+    doors: the same for patches of turning parts, which hardly have insides that go with them, and for pieces that hang
+    apart from their part. drawers: for patches of sliding parts, which have such insides. rest: at least this for
+    patches most of whose neighbours gave way.
+    boards: whether flat boards inside (shelves, partitions, bottoms of drawers) are looked for, before which walls are
+    not seen.
+    patch: Gaussians a patch. looks, checks: views of a state from which rays are cast, and by which patches are judged;
+    size: their long edge in pixels. apart: surfaces that the other state shows within this are confirmed by it; cell:
+    grid of the walls; wall: their thickness (all internal units).
     """
 
     may_lose: float = 1.25
@@ -73,9 +78,12 @@ class Opening:
         return replace(state, gaussians=GaussianTensors.cat([state.gaussians[self.kept], self.behind]))
 
 
-def unconfirmed(g: GaussianTensors, labels: Tensor, transforms: Tensor, other: GaussianTensors, stack: DepthStack, apart: float) -> Tensor:
-    """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its views see, and farther
-    than ``apart`` from its surfaces.  transforms [K-1, 4, 4] to the other state; stack: its rendered depth."""
+def unconfirmed(
+    g: GaussianTensors, labels: Tensor, transforms: Tensor, other: GaussianTensors, stack: DepthStack, apart: float
+) -> Tensor:
+    """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its
+    views see, and farther than ``apart`` from its surfaces.  transforms [K-1, 4, 4] to the other state; stack: its
+    rendered depth."""
     at = landed(g.means, labels, transforms)
     solid = torch.sigmoid(other.opacity_logits) > SOLID
     return out_of_sight(at, stack) & (knn(other.means[solid], at, 1, False)[0][:, 0] > apart)
@@ -85,7 +93,8 @@ BASE, DOOR, DRAWER = range(3)
 
 
 def kinds(g: GaussianTensors, labels: Tensor, types: list[str]) -> Tensor:
-    """What each Gaussian is taken for, [N]: the BASE's, a DOOR's (as pieces apart from their part are) or a DRAWER's. labels [N]."""
+    """What each Gaussian is taken for, [N]: the BASE's, a DOOR's (as pieces apart from their part are) or a DRAWER's.
+    labels [N]."""
     kind = torch.tensor([BASE] + [DRAWER if t == "prismatic" else DOOR for t in types])[labels]
     solid = (torch.sigmoid(g.opacity_logits) > SOLID).nonzero().squeeze(1)
     apart = find_islands(g.means[solid], labels[solid], APART) >= 0
@@ -96,12 +105,16 @@ def kinds(g: GaussianTensors, labels: Tensor, types: list[str]) -> Tensor:
 class OneState:
     """One state's lids and what is behind them: g its Gaussians; lids [N] bool; kind [N]: see ``kinds``."""
 
-    def __init__(self, g: GaussianTensors, lids: Tensor, kind: Tensor, views, config: OpeningsConfig, backend: str, device):
+    def __init__(
+        self, g: GaussianTensors, lids: Tensor, kind: Tensor, views, config: OpeningsConfig, backend: str, device
+    ):
         self.g, self.views, self.config, self.backend, self.device = g, views, config, backend, device
         self.rows = lids.nonzero().squeeze(1)
         self.patch = patches(g[self.rows], config.patch)
         self.count = int(self.patch.max()) + 1
-        votes = torch.zeros(self.count, 3).index_put_((self.patch, kind[self.rows]), torch.ones(len(self.rows)), accumulate=True)
+        votes = torch.zeros(self.count, 3).index_put_(
+            (self.patch, kind[self.rows]), torch.ones(len(self.rows)), accumulate=True
+        )
         self.allowed = torch.tensor([config.may_lose, config.doors, config.drawers])[votes.argmax(1)]
         self.level = min(range(len(views.levels)), key=lambda i: abs(views.levels[i] - config.size))
 
@@ -121,7 +134,10 @@ class OneState:
             depth = (out.expected_depth if out.median_depth is None else out.median_depth).cpu()
             y, x = ((out.features[..., 0].cpu() > 0.5) & (shot.alpha > 0.9) & (depth > 0)).nonzero().unbind(1)
             K, W = shot.camera.K.double(), shot.camera.viewmat.double()
-            ray = torch.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], torch.ones(len(x), dtype=torch.float64)], 1)
+            ray = torch.stack(
+                [(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], torch.ones(len(x), dtype=torch.float64)],
+                1,
+            )
             start = (ray * depth[y, x, None].double() - W[:3, 3]) @ W[:3, :3]
             way = torch.nn.functional.normalize(ray @ W[:3, :3], dim=1)
             patch = self.patch[knn(self.g.means[self.rows], start.float(), 1, False)[1][:, 0]]
@@ -130,8 +146,8 @@ class OneState:
         return rays[rays.far.isfinite()]
 
     def backdrops(self, walls: Walls, stacks: list[DepthStack]) -> list[Backdrop]:
-        """What rays that meet a lid may meet behind it: walls alone; boards before them, where photographs agree on these more than on
-        the lid; and where they do more than on the walls."""
+        """What rays that meet a lid may meet behind it: walls alone; boards before them, where photographs agree on
+        these more than on the lid; and where they do more than on the walls."""
         rays, near = self.rays(walls), 2 * self.config.cell
         wall, unseen = self.inner_side(rays.start + rays.far.clamp_max(DEEPEST)[:, None] * rays.way, rays.way, stacks)
         out = [self.backdrop(rays, wall, unseen, 0)]
@@ -154,8 +170,8 @@ class OneState:
         return Backdrop(points, where, rays.colour, rays.patch, cell, boards)
 
     def inner_side(self, met: Tensor, way: Tensor, stacks: list[DepthStack]) -> tuple[Tensor, Tensor]:
-        """Points [R, 3] before the walls that rays along ``way`` [R, 3] ``met`` [R, 3], at the first of a few depths that no view of either
-        state sees; and whether there is one [R]."""
+        """Points [R, 3] before the walls that rays along ``way`` [R, 3] ``met`` [R, 3], at the first of a few depths
+        that no view of either state sees; and whether there is one [R]."""
         place, found = met.float(), torch.zeros(len(met), dtype=torch.bool)
         for factor in (1.0, 1.5, 2.0, 2.7):
             tried = (met - factor * self.config.wall * way).float()
@@ -174,8 +190,8 @@ class OneState:
         return out
 
     def choose(self, backdrops: list[Backdrop]) -> tuple[Tensor, Backdrop]:
-        """Patches [K] bool that give way together, and their backdrop: the one with the least image error of those that let most of the
-        patches' Gaussians do so."""
+        """Patches [K] bool that give way together, and their backdrop: the one with the least image error of those that
+        let most of the patches' Gaussians do so."""
         grey = torch.full((3,), 0.5)
         shots = [self.views.get(i, self.level, grey) for i in self.views.spread(self.config.checks)]
         onehot = torch.zeros(len(self.g), self.count)
@@ -183,11 +199,15 @@ class OneState:
         chunks = onehot.split(MAX_FEATURES, 1)
         weight = [torch.cat([self.render(self.g, s.camera, grey, c).features.cpu() for c in chunks], -1) for s in shots]
         pixels = [w.sum(-1) > 0.01 for w in weight]
-        weight = torch.cat([w[p] for w, p in zip(weight, pixels, strict=True)]).T.contiguous()  # [K, pixels that any patch covers]
+        weight = torch.cat(
+            [w[p] for w, p in zip(weight, pixels, strict=True)]
+        ).T.contiguous()  # [K, pixels that any patch covers]
 
         def over_patches(g: GaussianTensors) -> Tensor:
             pictures = [self.render(g, s.camera, grey).colour.cpu() for s in shots]
-            return weight @ torch.cat([(x - s.image).abs().sum(-1)[p] for x, s, p in zip(pictures, shots, pixels, strict=True)])
+            return weight @ torch.cat(
+                [(x - s.image).abs().sum(-1)[p] for x, s, p in zip(pictures, shots, pixels, strict=True)]
+            )
 
         cover, was = weight.sum(1), over_patches(self.g)
 
@@ -206,9 +226,9 @@ class OneState:
     def give_way(self, judged: Tensor, met: Tensor, worse: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Patches [K] bool that give way together, of those ``judged`` [K] bool.
 
-        All behind which rays ``met`` [K] bool something go at first; while pixels of some are explained too much ``worse``, the worst
-        stays, or the worse half of those that fail by far. What stayed because of others is tried once more, one by one, and at last what
-        is left amid those that went: a lid is one surface.
+        All behind which rays ``met`` [K] bool something go at first; while pixels of some are explained too much
+        ``worse``, the worst stays, or the worse half of those that fail by far. What stayed because of others is tried
+        once more, one by one, and at last what is left amid those that went: a lid is one surface.
         """
         chosen, allowed = judged & met, self.allowed
         while chosen.any():
@@ -244,8 +264,8 @@ class OneState:
         return count[1] > 0.5 * count[0].clamp_min(1)
 
     def without(self, chosen: Tensor, backdrop: Backdrop) -> tuple[GaussianTensors, Tensor, Tensor]:
-        """The state with the backdrop, at its end, instead of the patches ``chosen`` [K] bool; which of its own it keeps [N] bool; which
-        of the backdrop's a ray fell on or beside."""
+        """The state with the backdrop, at its end, instead of the patches ``chosen`` [K] bool; which of its own it
+        keeps [N] bool; which of the backdrop's a ray fell on or beside."""
         keep = torch.ones(len(self.g), dtype=torch.bool)
         keep[self.rows[chosen[self.patch]]] = False
         behind, near = backdrop.gaussians(chosen, self.g.sh.shape[1])
@@ -263,8 +283,8 @@ def open_up(
     backend: str,
     device="cpu",
 ) -> tuple[list[Opening], PartMotions, list[DepthStack], list[dict]]:
-    """By state, which lids give way to the inner sides of the walls behind them; the motions with labels of these (the base's), the depth
-    of both states so opened, and what was counted, by state.
+    """By state, which lids give way to the inner sides of the walls behind them; the motions with labels of these (the
+    base's), the depth of both states so opened, and what was counted, by state.
 
     views: ``TrainingViews`` by state; stacks: rendered depth of both states.
     """
@@ -277,14 +297,18 @@ def open_up(
         return out, motions, stacks, counted
     lids = [unconfirmed(g[s], motions.labels[s], away[s], g[1 - s], stacks[1 - s], config.apart) for s in (0, 1)]
     base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
-    box = torch.quantile(torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0)
+    box = torch.quantile(
+        torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0
+    )
     walls = Walls(torch.cat([over_surface(x[k]) for x, k in zip(g, base, strict=True)]), box[0], box[1], config.cell)
     labels, margin, depth = list(motions.labels), list(motions.margin), list(stacks)
     for s in (0, 1):
         counted[s]["unconfirmed"] = int(lids[s].sum())
         if int((lids[s] & solid[s]).sum()) < config.patch:
             continue
-        state = OneState(g[s], lids[s], kinds(g[s], motions.labels[s], motions.types), views[s], config, backend, device)
+        state = OneState(
+            g[s], lids[s], kinds(g[s], motions.labels[s], motions.types), views[s], config, backend, device
+        )
         chosen, backdrop = state.choose(state.backdrops(walls, stacks))
         counted[s] |= {"patches": state.count, "boards": backdrop.boards, "gave_way": int(chosen.sum())}
         if not chosen.any():

@@ -1,8 +1,9 @@
 """What slides is one piece: pieces of a sliding part between which nobody saw it are joined along its axis.
 
-A blade in its handle, a rod in its tube: photographs show both ends of what slides, and the other parts hide the stretch between. A rigid
-part is connected, and what slides through a tight opening has the same section all along, so the section at the end of one piece goes on
-to the next. Only surfaces that no view contradicts are added. Not in the paper.
+A blade in its handle, a rod in its tube: photographs show both ends of what slides, and the other parts hide the
+stretch between. A rigid part is connected, and what slides through a tight opening has the same section all along, so
+the section at the end of one piece goes on to the next. Only surfaces that no view contradicts are added. Not in the
+paper.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from p2gs.surface.faces import Faces
 from p2gs.surface.unseen import NEAR, seen_empty, sewn
 
 LEAST = 0.1  # share of the largest piece's area that a piece has
-ALIKE = 0.6  # interquartile range of a section's length along a piece, in its median, up to which the section is the same all along
+# interquartile range of a section's length along a piece, in its median, up to which the section is the same all along
+ALIKE = 0.6
 WITHIN = 3.0  # voxels from a piece's end at which its section is taken: the end itself is ragged
 APART = 1.5  # voxels from what was seen to what is added
 OUT = 1.5  # voxels by which what is added may stand out of what hides it
@@ -29,8 +31,8 @@ MOST = 0.5  # share of it that views may contradict
 
 
 class Piece:
-    """A connected piece of a mesh, as it goes along an axis.  lo, hi: its ends along the axis, without what is thinner than half of its
-    section.  ragged: [2], with that.  area: of its surface.  alike: how much its section varies."""
+    """A connected piece of a mesh, as it goes along an axis.  lo, hi: its ends along the axis, without what is thinner
+    than half of its section.  ragged: [2], with that.  area: of its surface.  alike: how much its section varies."""
 
     def __init__(self, mesh: Mesh, axis: np.ndarray, voxel: float):
         self.mesh, self.axis, self.voxel = mesh, axis, voxel
@@ -54,15 +56,17 @@ class Piece:
 
 
 def bridge(left: Piece, right: Piece, drawn: Piece) -> Optional[Mesh]:
-    """What may join two pieces, the left one before the right one along their axis: the section of ``drawn``, one of them, from within its
-    end to the other one; None where that is not the same along more of it than the gap, or there is no gap."""
+    """What may join two pieces, the left one before the right one along their axis: the section of ``drawn``, one of
+    them, from within its end to the other one; None where that is not the same along more of it than the gap, or there
+    is no gap."""
     gap, piece = right.ragged[0] - left.ragged[1], drawn
     if gap <= 0 or piece.alike > ALIKE or piece.hi - piece.lo < gap:
         return None
     inset = WITHIN * piece.voxel
     start, end = (left.hi - inset, right.ragged[0]) if piece is left else (right.lo + inset, left.ragged[1])
     lines = piece.section(start)
-    first, place = unique_rows(np.round(lines.reshape(-1, 3) / (1e-3 * piece.voxel)).astype(np.int64))  # ends that segments share
+    # ends that segments share
+    first, place = unique_rows(np.round(lines.reshape(-1, 3) / (1e-3 * piece.voxel)).astype(np.int64))
     ring, place = lines.reshape(-1, 3)[first], place.reshape(-1, 2)
     count = max(1, round(abs(end - start) / piece.voxel))
     steps = np.linspace(0, end - start, count + 1)
@@ -74,10 +78,14 @@ def bridge(left: Piece, right: Piece, drawn: Piece) -> Optional[Mesh]:
     return Mesh(points.reshape(-1, 3), faces, np.zeros((points[..., 0].size, 3), np.uint8))
 
 
-def join_pieces(mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float) -> Mesh:
-    """The mesh of a part that slides along ``axis`` [3], its pieces joined where none of the views saw that nothing is between.
+def join_pieces(
+    mesh: Mesh, axis: np.ndarray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float
+) -> Mesh:
+    """The mesh of a part that slides along ``axis`` [3], its pieces joined where none of the views saw that nothing is
+    between.
 
-    Of two ways the one that they contradict less.  views, poses, voxel: as in ``close_unseen_sides``, of the sliding part.
+    Of two ways the one that they contradict less.  views, poses, voxel: as in ``close_unseen_sides``, of the sliding
+    part.
     """
     if len(mesh.faces) == 0:
         return mesh

@@ -1,6 +1,7 @@
 """Plinths: what stands on a narrower frame has its bottom on top of that frame, not down on the floor.
 
-A cupboard with a recess for the toes rests on walls and a kick board; its lowest board lies where the front steps out over them.
+A cupboard with a recess for the toes rests on walls and a kick board; its lowest board lies where the front steps out
+over them.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ ABOVE = 6  # levels over the step that stand out
 
 
 def edges(mesh: Mesh, axis: int, outward: float, at: float, levels: int, voxel: float) -> np.ndarray:
-    """How far out the walls of levels reach, [levels, 4]: towards both ends of each of the other two axes; nan where there are none.
+    """How far out the walls of levels reach, [levels, 4]: towards both ends of each of the other two axes; nan where
+    there are none.
 
     Levels are a voxel apart, from ``at`` along the axis on, against ``outward`` (1 or -1).
     """
@@ -38,8 +40,8 @@ def edges(mesh: Mesh, axis: int, outward: float, at: float, levels: int, voxel: 
 
 
 def plinth_height(mesh: Mesh, axis: int, outward: float, at: float, height: float, voxel: float) -> float:
-    """How high the plinth is on which a mesh of ``height`` stands at ``at``, ``outward`` (1 or -1) being down along the axis; 0 where it
-    stands on none."""
+    """How high the plinth is on which a mesh of ``height`` stands at ``at``, ``outward`` (1 or -1) being down along the
+    axis; 0 where it stands on none."""
     lowest, highest = (int(share * height / voxel) for share in HEIGHT)
     edge = edges(mesh, axis, outward, at, highest + ABOVE, voxel)
     best, found = STEP * height, 0

@@ -1,4 +1,5 @@
-"""How ArtGS, whose protocol the paper's tables follow, makes the surfaces that it scores, where p2gs's own way differs."""
+"""How ArtGS, whose protocol the paper's tables follow, makes the surfaces that it scores, where p2gs's own way
+differs."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from p2gs.types import ArticulatedObject, Camera, Part, UserError
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """``complete``, ``whole`` and ``cluster`` of ``phases.finish`` (``models.finish.FinishConfig`` says what they mean)."""
+    """``complete``, ``whole`` and ``cluster`` of ``phases.finish`` (``models.finish.FinishConfig`` says what they
+    mean)."""
 
     complete: bool = True
     whole: Literal["joined", "separate"] = "joined"
@@ -26,7 +28,8 @@ class SurfaceOptions:
 
 
 def surface_options(run_dir: Path | str) -> SurfaceOptions:
-    """The options in RUN/config.yaml; the defaults where the file or a key is missing. Raises UserError where it cannot be read."""
+    """The options in RUN/config.yaml; the defaults where the file or a key is missing. Raises UserError where it cannot
+    be read."""
     import yaml
 
     path = Path(run_dir) / "config.yaml"
@@ -37,10 +40,14 @@ def surface_options(run_dir: Path | str) -> SurfaceOptions:
         given = (tree.get("phases") or {}).get("finish") or {}
         return SurfaceOptions(**{f.name: given[f.name] for f in fields(SurfaceOptions) if f.name in given})
     except (yaml.YAMLError, AttributeError, ValueError, TypeError, RecursionError, OverflowError) as err:
-        raise UserError(f"{path}: phases.finish cannot be read ({err}); expected a mapping with complete, whole and cluster") from err
+        raise UserError(
+            f"{path}: phases.finish cannot be read ({err}); expected a mapping with complete, whole and cluster"
+        ) from err
 
 
-def separate_whole(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], state: int, resolution: int = RESOLUTION) -> Mesh:
+def separate_whole(
+    obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], state: int, resolution: int = RESOLUTION
+) -> Mesh:
     """The whole object's surface in one state from that state's views alone, without regard to parts.
 
     obj and cameras ((state, camera) pairs) in one coordinate system; resolution: voxels along the longest side.
@@ -52,14 +59,16 @@ def separate_whole(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]]
 def largest_clusters(obj: ArticulatedObject, eps: float) -> ArticulatedObject:
     """The twin without the Gaussians of moving parts that are not in their part's largest cluster.
 
-    eps: DBSCAN's radius, units of ``obj``, with two points making a core (ArtGS's min_samples), for which the clusters are the connected
-    components of the points nearer to each other than eps (Ester et al. 1996).
+    eps: DBSCAN's radius, units of ``obj``, with two points making a core (ArtGS's min_samples), for which the clusters
+    are the connected components of the points nearer to each other than eps (Ester et al. 1996).
     """
     keep = torch.ones(len(obj.gaussians), dtype=torch.bool)
     for part in obj.parts:
         rows = (obj.part_ids == part.id).nonzero()[:, 0]
         if part.joint is not None and len(rows):
-            keep[rows] = torch.from_numpy(_largest_component(obj.gaussians.means[rows].detach().cpu().double().numpy(), eps))
+            keep[rows] = torch.from_numpy(
+                _largest_component(obj.gaussians.means[rows].detach().cpu().double().numpy(), eps)
+            )
     return replace(obj, gaussians=obj.gaussians[keep], part_ids=obj.part_ids[keep])
 
 

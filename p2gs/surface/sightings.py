@@ -35,8 +35,9 @@ def start_motion(obj: ArticulatedObject, part: int, t: float) -> Tensor:
 
 @dataclass
 class PartView:
-    """What a camera sees of a twin. depth [H, W] along z, 0 where little is hit.  label [H, W] int64: the part that covers most of a
-    pixel, -1 where little is hit.  colour [H, W, 3] in 0..1.  alpha [H, W].  spread [H, W]: see ``surface_depth``."""
+    """What a camera sees of a twin. depth [H, W] along z, 0 where little is hit.  label [H, W] int64: the part that
+    covers most of a pixel, -1 where little is hit.  colour [H, W, 3] in 0..1.  alpha [H, W].  spread [H, W]: see
+    ``surface_depth``."""
 
     depth: Tensor
     label: Tensor
@@ -48,8 +49,9 @@ class PartView:
 def look(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera, near: float) -> PartView:
     """Draw the parts. part_index [N] in 0..parts-1.
 
-    near: where what a ray meets lies within this, as a standard deviation, it is one surface (``surface_depth``). Where it is not, the ray
-    meets two, the mean of which lies on neither: the depth is then that at which transmittance passes one half.
+    near: where what a ray meets lies within this, as a standard deviation, it is one surface (``surface_depth``). Where
+    it is not, the ray meets two, the mean of which lies on neither: the depth is then that at which transmittance
+    passes one half.
     """
     onehot = torch.nn.functional.one_hot(part_index, parts).float()
     out = draw(g, camera, 0.0, features=onehot[:, :MAX_FEATURES])
@@ -69,8 +71,8 @@ def look(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera, nea
 
 
 def fog_limit(looks: Sequence[PartView], size: float) -> float:
-    """Spread beyond which a ray has met fog: ``FOG`` times what is usual in this twin, as a coarse one is loose everywhere; at least a
-    fiftieth of its longest side ``size``."""
+    """Spread beyond which a ray has met fog: ``FOG`` times what is usual in this twin, as a coarse one is loose
+    everywhere; at least a fiftieth of its longest side ``size``."""
     solid = [v.spread[v.alpha > FIRM] for v in looks]
     spread = torch.cat(solid) if solid else torch.zeros(0)
     return max(FOG * float(spread.median()) if len(spread) else 0.0, NEAR * size)
@@ -79,7 +81,8 @@ def fog_limit(looks: Sequence[PartView], size: float) -> float:
 def trust(seen: PartView, limit: float) -> Tensor:
     """[H, W] in 0..1, how much a pixel's depth says of a surface. limit: see ``fog_limit``.
 
-    Fog covers a pixel poorly or is spread along its ray: no surface may come of it (it still hides nothing that others see before it).
+    Fog covers a pixel poorly or is spread along its ray: no surface may come of it (it still hides nothing that others
+    see before it).
     """
     firm = (seen.alpha > FIRM) & (seen.spread < limit)
     return firm / (1 + (2 * seen.spread / limit) ** 2)
@@ -93,8 +96,8 @@ def beside_others(label: Tensor) -> Tensor:
 
 @dataclass
 class Sightings:
-    """What cameras see of a twin's parts. voxel: of what is made of it.  views: labelled by place in ``obj.parts``.  motions: of each
-    part, start state -> start and end.  poses: of each part, one a view."""
+    """What cameras see of a twin's parts. voxel: of what is made of it.  views: labelled by place in ``obj.parts``.
+    motions: of each part, start state -> start and end.  poses: of each part, one a view."""
 
     voxel: float
     views: list[DepthView]
@@ -112,7 +115,8 @@ class Sightings:
 
 
 def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> Sightings:
-    """Look at the parts. obj and cameras ((state, camera) pairs) in one coordinate system. resolution: as in ``part_meshes``."""
+    """Look at the parts. obj and cameras ((state, camera) pairs) in one coordinate system. resolution: as in
+    ``part_meshes``."""
     lo, hi = bounds(obj, (0.0,))
     size = float((hi - lo).max())
     voxel = size / resolution
@@ -120,7 +124,9 @@ def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolut
     for k, part in enumerate(obj.parts):
         index[part.id] = k
     posed = [pose(obj, 0.0), pose(obj, 1.0)]
-    looks = [look(posed[state], index[obj.part_ids], len(obj.parts), camera, near=NEAR * size) for state, camera in cameras]
+    looks = [
+        look(posed[state], index[obj.part_ids], len(obj.parts), camera, near=NEAR * size) for state, camera in cameras
+    ]
     limit = fog_limit(looks, size)
     views = []
     for seen, (_, camera) in zip(looks, cameras, strict=True):

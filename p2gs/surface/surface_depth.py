@@ -1,7 +1,8 @@
 """Depth of a surface made of Gaussians: where rays meet the Gaussians' planes, not how far away their middles are.
 
-A ray that grazes a surface of large flat Gaussians meets, in front, tails of Gaussians whose middles are nearer than the surface is there.
-Depth composited from middles is off by as much as the Gaussians are large, differently in every view, and the surface is torn.
+A ray that grazes a surface of large flat Gaussians meets, in front, tails of Gaussians whose middles are nearer than
+the surface is there. Depth composited from middles is off by as much as the Gaussians are large, differently in every
+view, and the surface is torn.
 """
 
 from __future__ import annotations
@@ -19,24 +20,29 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of coordinates, for 
 
 
 def planes(g: GaussianTensors, eye: Tensor) -> Tensor:
-    """Unit normals [N, 3] of the planes through the Gaussians' middles in which they are densest along rays from ``eye`` [3] past them.
+    """Unit normals [N, 3] of the planes through the Gaussians' middles in which they are densest along rays from
+    ``eye`` [3] past them.
 
-    To first order that is the plane across inverse(covariance) (mean - eye): the flat side of a flat Gaussian, and across the ray for
-    a round one (RaDe-GS, arXiv:2406.01467).
+    To first order that is the plane across inverse(covariance) (mean - eye): the flat side of a flat Gaussian, and
+    across the ray for a round one (RaDe-GS, arXiv:2406.01467).
     """
     away = g.means - eye
     R = so3.quat_to_matrix(so3.quat_normalize(g.quats))
     along = (R.transpose(1, 2) @ away[..., None])[..., 0]
     sharpest = g.log_scales.amin(1, keepdim=True)  # any common factor will do
-    return torch.nn.functional.normalize((R @ (along * torch.exp(2 * (sharpest - g.log_scales)))[..., None])[..., 0], dim=1)
+    return torch.nn.functional.normalize(
+        (R @ (along * torch.exp(2 * (sharpest - g.log_scales)))[..., None])[..., 0], dim=1
+    )
 
 
 def surface_depth(g: GaussianTensors, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Depth along z [H, W] at which pixels meet the mean of the Gaussians' planes (PGSR, arXiv:2406.06521), 0 where nothing is or the
-    plane is seen edge-on; and how far the planes lie about it, as a standard deviation across the surface [H, W]."""
+    """Depth along z [H, W] at which pixels meet the mean of the Gaussians' planes (PGSR, arXiv:2406.06521), 0 where
+    nothing is or the plane is seen edge-on; and how far the planes lie about it, as a standard deviation across the
+    surface [H, W]."""
     normal = planes(g, camera.position.to(g.means))
     centre = g.means.mean(0) if len(g) else g.means.new_zeros(3)
-    offset = ((g.means - centre) * normal).sum(1, keepdim=True)  # from planes through the centre: differences of large numbers lose bits
+    # from planes through the centre: differences of large numbers lose bits
+    offset = ((g.means - centre) * normal).sum(1, keepdim=True)
     rotation = camera.viewmat[:3, :3].to(normal)
     n = normal @ rotation.T
     pairs = torch.stack([n[:, i] * n[:, j] for i, j in PAIRS], 1)

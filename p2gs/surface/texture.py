@@ -1,7 +1,7 @@
 """Baked textures: a picture for each part's surface, finer than its vertices, for programs that show no vertex colours.
 
-Two triangles share a square tile of the picture. A texel takes the mean of what the views saw at its place, as vertices do; where nobody
-saw it, its triangle's vertices' colours.
+Two triangles share a square tile of the picture. A texel takes the mean of what the views saw at its place, as vertices
+do; where nobody saw it, its triangle's vertices' colours.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ TILE = 8  # texels along a tile; the short edges of a triangle get TILE - 3
 
 @dataclass(frozen=True)
 class Texture:
-    """uv [F, 3, 2]: of each triangle's corners, from the picture's lower left corner, in 0..1.  image [H, W, 3] uint8, upper row first."""
+    """uv [F, 3, 2]: of each triangle's corners, from the picture's lower left corner, in 0..1.  image [H, W, 3] uint8,
+    upper row first."""
 
     uv: np.ndarray
     image: np.ndarray
@@ -42,9 +43,11 @@ class Texture:
 
 
 def tiles(count: int) -> tuple[tuple[int, int], np.ndarray]:
-    """Width and height of the picture [texels] of ``count`` triangles, and column and row of the first texel of each one's tile [count, 2].
+    """Width and height of the picture [texels] of ``count`` triangles, and column and row of the first texel of each
+    one's tile [count, 2].
 
-    Both sides are powers of two, as older graphics hardware and some importers demand, the width once or twice the height.
+    Both sides are powers of two, as older graphics hardware and some importers demand, the width once or twice the
+    height.
     """
     doublings = max((count + 1) // 2 - 1, 0).bit_length()
     across = 2 ** ((doublings + 1) // 2)
@@ -53,10 +56,11 @@ def tiles(count: int) -> tuple[tuple[int, int], np.ndarray]:
 
 
 def layout(count: int) -> tuple[tuple[int, int], np.ndarray]:
-    """Width and height of the picture [texels] and uv of the corners of ``count`` triangles in it, [count, 3, 2] (``Texture``).
+    """Width and height of the picture [texels] and uv of the corners of ``count`` triangles in it, [count, 3, 2]
+    (``Texture``).
 
-    Corners lie on the centres of texels, and between the two triangles of a tile is room for both, so that no colour of a neighbour shows
-    where a picture is read between texels.
+    Corners lie on the centres of texels, and between the two triangles of a tile is room for both, so that no colour of
+    a neighbour shows where a picture is read between texels.
     """
     size, first = tiles(count)
     lower = np.array([[0, 0], [TILE - 3, 0], [0, TILE - 3]])
@@ -68,7 +72,8 @@ def layout(count: int) -> tuple[tuple[int, int], np.ndarray]:
 
 
 def texels(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each texel that ``count`` triangles need: its triangle [n], barycentric coordinates there [n, 3], and column and row [n, 2]."""
+    """Of each texel that ``count`` triangles need: its triangle [n], barycentric coordinates there [n, 3], and column
+    and row [n, 2]."""
     i, j = (x.ravel() for x in np.meshgrid(np.arange(TILE), np.arange(TILE)))
     short = TILE - 3
     own = [i + j <= TILE - 2, i + j >= TILE - 1]

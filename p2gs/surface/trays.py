@@ -1,8 +1,9 @@
 """Drawers whose rear no photograph shows are completed as trays.
 
-A drawer is seen as far as it comes out of the body: its front, the beginnings of its sides, often not its bottom. What slides out of an
-opening behind a front, with two sides and open between them, is taken for a tray that ends a little before the body does. Its sides,
-bottom and rear are added where nothing of the part was seen, and what would stand in its way is taken out of the body. Not in the paper.
+A drawer is seen as far as it comes out of the body: its front, the beginnings of its sides, often not its bottom. What
+slides out of an opening behind a front, with two sides and open between them, is taken for a tray that ends a little
+before the body does. Its sides, bottom and rear are added where nothing of the part was seen, and what would stand in
+its way is taken out of the body. Not in the paper.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ FLAT = 0.8  # cosine with a direction from which a triangle faces it
 FRONT = 0.5  # share of its rectangle that a front fills
 BEGINNING = 0.5  # share of a side's height along which it must be seen
 BESIDE = 0.5  # share of the front's extent within which a side is looked for from the front's edge
-OUTER = 0.25  # quantile of the distances from the edge at which a side stands: what is dim is drawn towards the eye, inwards
+# quantile of the distances from the edge at which a side stands: what is dim is drawn towards the eye, inwards
+OUTER = 0.25
 REAR = 0.4  # share of the front's rectangle that a seen rear fills
 LID = 0.5  # share of the mouth, as far as it comes out, that a surface fills which closes it
 BOTTOM = 0.2  # and that a bottom fills where it is seen; below, that is where the sides end
@@ -38,8 +40,8 @@ DEPTH = 0.8  # of the way from the front to the end of the body behind it
 
 @dataclass(frozen=True)
 class Front:
-    """A plate across the direction of sliding. axes [3, 3]: rows outward, along its width, along its height; lo, hi [2]: its rectangle in
-    the latter two; back: where it ends inwards, along the first."""
+    """A plate across the direction of sliding. axes [3, 3]: rows outward, along its width, along its height; lo, hi
+    [2]: its rectangle in the latter two; back: where it ends inwards, along the first."""
 
     axes: np.ndarray
     lo: np.ndarray
@@ -64,7 +66,9 @@ def find_front(mesh: Mesh, outward: np.ndarray, voxel: float) -> Optional[Front]
         return None
     place = np.floor(faces.middle[:, 0] / voxel).astype(int)
     low = place.min()
-    profile = np.convolve(np.bincount(place[facing] - low, faces.area[facing], place.max() - low + 1), np.ones(3), "same")
+    profile = np.convolve(
+        np.bincount(place[facing] - low, faces.area[facing], place.max() - low + 1), np.ones(3), "same"
+    )
     at = (profile.argmax() + low + 0.5) * voxel
     plate = facing & (np.abs(faces.middle[:, 0] - at) < 2.5 * voxel)
     angle = np.radians(cv2.minAreaRect(faces.middle[plate, 1:].astype(np.float32))[2])
@@ -74,15 +78,20 @@ def find_front(mesh: Mesh, outward: np.ndarray, voxel: float) -> Optional[Front]
     if (hi - lo).min() < 4 * voxel or faces.area[plate].sum() < FRONT * np.prod(hi - lo):
         return None
     front = Front(axes, lo, hi, at)
-    inner = (faces.normal[:, 0] < -FLAT) & front.across(faces) & (faces.middle[:, 0] < at) & (faces.middle[:, 0] > at - 12 * voxel)
+    inner = (
+        (faces.normal[:, 0] < -FLAT)
+        & front.across(faces)
+        & (faces.middle[:, 0] < at)
+        & (faces.middle[:, 0] > at - 12 * voxel)
+    )
     back = quantile(faces.middle[inner, 0], faces.area[inner]) if inner.any() else at - 2 * voxel
     return Front(axes, lo, hi, back)
 
 
 @dataclass(frozen=True)
 class Side:
-    """A side of a drawer as far as it was seen. at: where it stands along one axis of the front; lo, hi: its ends along the other;
-    inner: how far inwards; area: of what was seen."""
+    """A side of a drawer as far as it was seen. at: where it stands along one axis of the front; lo, hi: its ends along
+    the other; inner: how far inwards; area: of what was seen."""
 
     at: float
     lo: float
@@ -92,7 +101,8 @@ class Side:
 
 
 def _extent(values: np.ndarray, areas: np.ndarray, voxel: float) -> tuple[float, float]:
-    """From where to where a surface goes along an axis, without what juts out of it: cells that hold half of what most do."""
+    """From where to where a surface goes along an axis, without what juts out of it: cells that hold half of what most
+    do."""
     cell = np.floor(values / voxel).astype(int)
     low = cell.min()
     held = np.bincount(cell - low, areas)
@@ -101,11 +111,17 @@ def _extent(values: np.ndarray, areas: np.ndarray, voxel: float) -> tuple[float,
 
 
 def find_side(faces: Faces, front: Front, axis: int, end: int, voxel: float) -> Optional[Side]:
-    """The side at the lower (``end`` 0) or upper (1) edge of the front's ``axis`` (0 width, 1 height), if its beginning is seen."""
+    """The side at the lower (``end`` 0) or upper (1) edge of the front's ``axis`` (0 width, 1 height), if its beginning
+    is seen."""
     edge, extent = (front.lo, front.hi)[end][axis], (front.hi - front.lo)[axis]
     behind = front.back - faces.middle[:, 0]
     from_edge = np.abs(faces.middle[:, 1 + axis] - edge)
-    wall = (np.abs(faces.normal[:, 1 + axis]) > FLAT) & (from_edge < BESIDE * extent) & front.across(faces) & (behind > voxel)
+    wall = (
+        (np.abs(faces.normal[:, 1 + axis]) > FLAT)
+        & (from_edge < BESIDE * extent)
+        & front.across(faces)
+        & (behind > voxel)
+    )
     if not wall.any():
         return None
     # the outermost of the places where most of it is
@@ -139,7 +155,8 @@ def end_of_body(body: Mesh, front: Front) -> Optional[float]:
 
 
 def mouth_of(front: Front, sides: Sequence[Sequence[Optional[Side]]], eyes: Tensor) -> Optional[tuple[int, int]]:
-    """(axis, end) of the side that most cameras face, of those between two seen ones: a tray is looked into. None without two such.
+    """(axis, end) of the side that most cameras face, of those between two seen ones: a tray is looked into. None
+    without two such.
 
     sides: by axis and end.  eyes [V, 3]: the cameras, in the mesh's coordinates.
     """
@@ -157,10 +174,11 @@ def mouth_of(front: Front, sides: Sequence[Sequence[Optional[Side]]], eyes: Tens
 
 @dataclass(frozen=True)
 class Tray:
-    """An open box behind a front. lo, hi [3]: its corners in the front's axes; mouth: (axis, end) of its open side, across the first.
+    """An open box behind a front. lo, hi [3]: its corners in the front's axes; mouth: (axis, end) of its open side,
+    across the first.
 
-    travel: how far it slides out.  drawn: the state in which it is out, 0 or 1.  shut [4, 4]: brings what it slides into from its place in
-    the start state to where, as seen from the drawer in its own, it is when the drawer is shut.
+    travel: how far it slides out.  drawn: the state in which it is out, 0 or 1.  shut [4, 4]: brings what it slides
+    into from its place in the start state to where, as seen from the drawer in its own, it is when the drawer is shut.
     """
 
     front: Front
@@ -172,7 +190,8 @@ class Tray:
     shut: np.ndarray
 
     def within(self, points: np.ndarray) -> np.ndarray:
-        """How far within each of its six sides points [N, 3], in the front's axes, are; negative outside, [N, 6]: first those at ``lo``."""
+        """How far within each of its six sides points [N, 3], in the front's axes, are; negative outside, [N, 6]: first
+        those at ``lo``."""
         return np.concatenate([points - self.lo, self.hi - points], 1)
 
     @property
@@ -185,8 +204,8 @@ class Tray:
 def find_tray(mesh: Mesh, body: Mesh, slide: np.ndarray, eyes: Tensor, voxel: float) -> Optional[Tray]:
     """The tray of which ``mesh`` is what was seen; None where it is none, or was seen to its rear.
 
-    body: what it slides into.  slide [4, 4]: its motion from the start state, in which both meshes stand, to the end.  eyes [V, 3]: the
-    cameras, in the sliding part's coordinates.
+    body: what it slides into.  slide [4, 4]: its motion from the start state, in which both meshes stand, to the end.
+    eyes [V, 3]: the cameras, in the sliding part's coordinates.
     """
     travel, drawn, shut = float(np.linalg.norm(slide[:3, 3])), 1, np.eye(4)
     if travel < voxel:
@@ -220,9 +239,11 @@ def find_tray(mesh: Mesh, body: Mesh, slide: np.ndarray, eyes: Tensor, voxel: fl
     return Tray(front, lo, hi, mouth, travel, drawn, shut)
 
 
-def complete_tray(mesh: Mesh, tray: Tray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float, clearance: float) -> Mesh:
-    """The mesh of what was seen of a sliding part, with the sides, bottom and rear of its tray where nothing was seen, and without what is
-    not the tray's.
+def complete_tray(
+    mesh: Mesh, tray: Tray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float, clearance: float
+) -> Mesh:
+    """The mesh of what was seen of a sliding part, with the sides, bottom and rear of its tray where nothing was seen,
+    and without what is not the tray's.
 
     views, poses, voxel, clearance: as in ``close_unseen_sides``, of the sliding part.
     """
@@ -245,8 +266,8 @@ def complete_tray(mesh: Mesh, tray: Tray, views: Sequence[DepthView], poses: Seq
 
 
 def clear_way(body: Mesh, tray: Tray, voxel: float) -> Mesh:
-    """What a tray slides into (in the start state) without what stands in its way: dim insides of drawers are drawn as lids, which may be
-    taken for the body's."""
+    """What a tray slides into (in the start state) without what stands in its way: dim insides of drawers are drawn as
+    lids, which may be taken for the body's."""
     middle = Faces(body.transformed(tray.shut), tray.front.axes).middle
     lo, hi = tray.lo + CLEAR * voxel, tray.hi - CLEAR * voxel
     hi[0] += tray.travel
@@ -254,17 +275,19 @@ def clear_way(body: Mesh, tray: Tray, voxel: float) -> Mesh:
 
 
 def not_the_trays(other: Mesh, tray: Tray, place: np.ndarray, voxel: float) -> Mesh:
-    """Another moving part's mesh (in its start state) without what lies in or on the tray while that is open: sides of the tray that were
-    labelled as the other's.
+    """Another moving part's mesh (in its start state) without what lies in or on the tray while that is open: sides of
+    the tray that were labelled as the other's.
 
-    place [4, 4]: from the other part's start state to where, as seen from the drawer in its own, it is while the drawer is open.
+    place [4, 4]: from the other part's start state to where, as seen from the drawer in its own, it is while the drawer
+    is open.
     """
     middle = Faces(other.transformed(place), tray.front.axes).middle
     return _without(other, (tray.within(middle) > -ON * voxel).all(1))
 
 
 def _without_strays(mesh: Mesh, tray: Tray, reach: float) -> Mesh:
-    """The mesh without what lies behind the front and farther than ``reach`` outside the tray, but before its mouth: another part's."""
+    """The mesh without what lies behind the front and farther than ``reach`` outside the tray, but before its mouth:
+    another part's."""
     middle = Faces(mesh, tray.front.axes).middle
     outside = np.stack([tray.lo[1:] - middle[:, 1:], middle[:, 1:] - tray.hi[1:]], 2) > reach
     outside[:, tray.mouth[0], tray.mouth[1]] = False
@@ -281,6 +304,10 @@ def _centre(mesh: Mesh) -> np.ndarray:
 
 
 def _lattice(lo: np.ndarray, hi: np.ndarray, step: float) -> tuple[np.ndarray, list[int]]:
-    """Points [n, 3] about ``step`` apart between two corners [3], and how many along each of the axes that are not flat."""
-    axes = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) if b > a else np.array([a]) for a, b in zip(lo, hi, strict=True)]
+    """Points [n, 3] about ``step`` apart between two corners [3], and how many along each of the axes that are not
+    flat."""
+    axes = [
+        np.linspace(a, b, max(2, round((b - a) / step) + 1)) if b > a else np.array([a])
+        for a, b in zip(lo, hi, strict=True)
+    ]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), [len(x) for x in axes if len(x) > 1]

@@ -1,8 +1,9 @@
 """Depth maps of a rigid part, fused into a truncated signed distance field and cut by marching cubes.
 
-Each part has its own volume in its start-state pose; views of every state are brought there by the part's motion, so that what
-one state hides another shows. Voxels are kept only near seen surface. Curless and Levoy (1996), doi 10.1145/237170.237269, with
-point-to-plane distances: the difference in depth times the cosine between ray and surface normal.
+Each part has its own volume in its start-state pose; views of every state are brought there by the part's motion, so
+that what one state hides another shows. Voxels are kept only near seen surface. Curless and Levoy (1996), doi
+10.1145/237170.237269, with point-to-plane distances: the difference in depth times the cosine between ray and surface
+normal.
 """
 
 from __future__ import annotations
@@ -22,11 +23,14 @@ from p2gs.surface.integrate import integrate
 BLOCK = 4  # voxels; active space is kept in cubes of this side
 
 
-def fuse(views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, trunc: float, behind: float) -> Mesh:
+def fuse(
+    views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, trunc: float, behind: float
+) -> Mesh:
     """The part's surface in its start-state pose.
 
-    views: all views, with normals.  poses: start-state coordinates -> world, [4, 4] each.  voxel: side.  trunc: distance in front
-    of the surface at which space counts as free.  behind: how far behind the surface it still counts (keeps thin panels apart).
+    views: all views, with normals.  poses: start-state coordinates -> world, [4, 4] each.  voxel: side.  trunc:
+    distance in front of the surface at which space counts as free.  behind: how far behind the surface it still counts
+    (keeps thin panels apart).
     """
     points = [seen_points(v, part, T) for v, T in zip(views, poses, strict=True)]
     points = torch.cat(points)
@@ -67,7 +71,8 @@ class ActiveGrid:
         return (self.origin + self.index.double() * self.voxel).float()
 
     def surface(self, field: Tensor, seen: Tensor, colour: Tensor) -> Mesh:
-        """Zero crossing of field [M] over the cells whose eight corners are seen [M]; colours [M, 3] in 0..1 carried along."""
+        """Zero crossing of field [M] over the cells whose eight corners are seen [M]; colours [M, 3] in 0..1 carried
+        along."""
         from scipy.ndimage import map_coordinates
         from skimage.measure import marching_cubes
 
@@ -76,7 +81,8 @@ class ActiveGrid:
         known = np.zeros(self.shape, bool)
         dense[i], known[i] = field[seen].numpy(), True
         dense, known = fill_pinholes(dense, known)
-        cell = known.copy()  # cell[x+1, y+1, z+1]: all corners x..x+1 known, which is where marching_cubes looks for its mask
+        # cell[x+1, y+1, z+1]: all corners x..x+1 known, which is where marching_cubes looks for its mask
+        cell = known.copy()
         for axis in range(3):
             a, b = [slice(None)] * 3, [slice(None)] * 3
             a[axis], b[axis] = slice(1, None), slice(None, -1)
@@ -85,9 +91,8 @@ class ActiveGrid:
             cell = shifted
         if not cell.any() or dense[known].min() >= 0 or dense[known].max() <= 0:
             return Mesh.empty()
-        vertices, faces, _, _ = marching_cubes(
-            dense, 0.0, mask=cell, gradient_direction="descent"
-        )  # faces look to where the field is positive
+        # faces look to where the field is positive
+        vertices, faces, _, _ = marching_cubes(dense, 0.0, mask=cell, gradient_direction="descent")
         rgb = np.zeros((len(vertices), 4))
         for c in range(4):
             volume = np.zeros(self.shape, np.float32)
@@ -112,7 +117,9 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(length > 0, normal / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
 
 
-def fill_pinholes(field: np.ndarray, known: np.ndarray, enough: float = 14 / 27, rounds: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def fill_pinholes(
+    field: np.ndarray, known: np.ndarray, enough: float = 14 / 27, rounds: int = 2
+) -> tuple[np.ndarray, np.ndarray]:
     """Give unknown voxels that most neighbours surround (at least ``enough`` of the 3^3 cube) the known ones' mean.
 
     Beyond the rim of an open surface a voxel has at most 9 known neighbours, so openings do not shrink.
@@ -121,7 +128,9 @@ def fill_pinholes(field: np.ndarray, known: np.ndarray, enough: float = 14 / 27,
 
     for _ in range(rounds):
         share = uniform_filter(known.astype(np.float32), 3, mode="constant")
-        mean = uniform_filter(np.where(known, field, 0).astype(np.float32), 3, mode="constant") / np.maximum(share, 1e-6)
+        mean = uniform_filter(np.where(known, field, 0).astype(np.float32), 3, mode="constant") / np.maximum(
+            share, 1e-6
+        )
         new = ~known & (share > enough - 1e-3)
         field, known = np.where(new, mean, field), known | new
     return field, known

@@ -1,8 +1,9 @@
 """Sides of a mesh that no camera saw: what stands on the floor has an underside, though no photograph shows it.
 
-A mesh from photographs is open where nobody looked. A side of its bounding box which no camera faced is closed by a plane where space
-just inside was never seen to be empty, no surface was seen near, and what was seen of the object reaches down to that plane around it. The
-plane's rim is drawn to the mesh's open edges. What stands on a plinth is closed on top of that.
+A mesh from photographs is open where nobody looked. A side of its bounding box which no camera faced is closed by a
+plane where space just inside was never seen to be empty, no surface was seen near, and what was seen of the object
+reaches down to that plane around it. The plane's rim is drawn to the mesh's open edges. What stands on a plinth is
+closed on top of that.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from p2gs.ops.unique_rows import unique_rows
 from p2gs.surface.depth_view import DepthView, pixel_matrix, pixels, seen_points
 from p2gs.surface.plinth import plinth_height
 
-NEAR = 4.0  # voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges
+# voxels: a seen surface nearer than this to a side of the box is that side; a plane's rim is drawn as far to open edges
+NEAR = 4.0
 LEAST = 0.2  # share of a side of the box that must be unseen for it to be closed
 FACED = 0.05  # share of the views that may face a side of which it is still said that nobody looked at it
 STRAY = 0.03  # share of the views up to which those that see through a place may be wrong: edges, gaps in a lid
@@ -28,8 +30,9 @@ RIM = 0.5  # share of the unseen area's rim that must touch seen surface
 
 
 def seen_empty(points: Tensor, views: Sequence[DepthView], poses: Sequence[Tensor], clearance: float) -> Tensor:
-    """[n] whether views, more than a stray one, see surface further than ``clearance`` behind a point, or nothing. points [n, 3] float64,
-    start-state coordinates of the part that ``poses`` (start-state coordinates -> world, [4, 4] a view) carry."""
+    """[n] whether views, more than a stray one, see surface further than ``clearance`` behind a point, or nothing.
+    points [n, 3] float64, start-state coordinates of the part that ``poses`` (start-state coordinates -> world, [4, 4]
+    a view) carry."""
     empty, columns = torch.zeros(len(points)), points.T.contiguous()
     for view, T in zip(views, poses, strict=True):
         z, pixel = pixels(columns, pixel_matrix(view.camera, T).to(points), view.camera)
@@ -40,20 +43,29 @@ def seen_empty(points: Tensor, views: Sequence[DepthView], poses: Sequence[Tenso
 
 def eyes_of(views: Sequence[DepthView], poses: Sequence[Tensor]) -> Tensor:
     """Where the views' cameras stand in the part's coordinates, [V, 3] float64."""
-    return torch.cat([se3.apply(se3.inverse(T.double()), v.camera.position.double()[None]) for v, T in zip(views, poses, strict=True)])
+    return torch.cat(
+        [
+            se3.apply(se3.inverse(T.double()), v.camera.position.double()[None])
+            for v, T in zip(views, poses, strict=True)
+        ]
+    )
 
 
 def facing(points: Tensor, outward: Tensor, eyes: Tensor, least: float = 0.2) -> float:
-    """Share of the cameras at ``eyes`` [V, 3] that see points [n, 3] of a plane, from their middle, under a cosine with its normal
-    ``outward`` [3] of at least ``least``."""
+    """Share of the cameras at ``eyes`` [V, 3] that see points [n, 3] of a plane, from their middle, under a cosine with
+    its normal ``outward`` [3] of at least ``least``."""
     way = torch.nn.functional.normalize(eyes - points.mean(0), dim=1)
     return float((way @ outward.double() >= least).double().mean())
 
 
-def close_unseen_sides(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, clearance: float) -> Mesh:
-    """The mesh with planes on the unseen sides of its box, sewn to its open edges and coloured as the seen surface nearest to them.
+def close_unseen_sides(
+    mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float, clearance: float
+) -> Mesh:
+    """The mesh with planes on the unseen sides of its box, sewn to its open edges and coloured as the seen surface
+    nearest to them.
 
-    mesh, poses: start-state coordinates of the part (its number in ``views``).  voxel: of the mesh.  clearance: as in ``seen_empty``.
+    mesh, poses: start-state coordinates of the part (its number in ``views``).  voxel: of the mesh.  clearance: as in
+    ``seen_empty``.
     """
     if len(mesh.faces) == 0:
         return mesh
@@ -96,7 +108,8 @@ def _touching(area: np.ndarray, seen: np.ndarray) -> float:
 
 
 def grid_plane(points: np.ndarray, area: np.ndarray, colours: np.ndarray, sign: float) -> Mesh:
-    """Two triangles for each grid cell whose corners are all in ``area`` [a, b]; points, colours [a b, 3]. sign: which way it faces."""
+    """Two triangles for each grid cell whose corners are all in ``area`` [a, b]; points, colours [a b, 3]. sign: which
+    way it faces."""
     index = np.arange(area.size).reshape(area.shape)
     i, j = np.nonzero(area[:-1, :-1] & area[1:, :-1] & area[:-1, 1:] & area[1:, 1:])
     corners = [index[i, j], index[i + 1, j], index[i + 1, j + 1], index[i, j + 1]]

@@ -1,4 +1,5 @@
-"""Walls that are known from outside, as a grid that rays meet, and the backdrop that photographs paint on their inner sides."""
+"""Walls that are known from outside, as a grid that rays meet, and the backdrop that photographs paint on their inner
+sides."""
 
 from __future__ import annotations
 
@@ -20,7 +21,10 @@ DEEPEST = 2.0  # how far behind a surface a wall is looked for, internal units
 
 def over_surface(g: GaussianTensors, count: int = 24, seed: int = 0) -> Tensor:
     """``count`` points of each Gaussian's body, within 1.7 standard deviations, [N * count, 3]."""
-    z = torch.randn(len(g), count, 3, generator=torch.Generator().manual_seed(seed)).clamp(-1.7, 1.7) * g.log_scales.exp()[:, None]
+    z = (
+        torch.randn(len(g), count, 3, generator=torch.Generator().manual_seed(seed)).clamp(-1.7, 1.7)
+        * g.log_scales.exp()[:, None]
+    )
     R = so3.quat_to_matrix(so3.quat_normalize(g.quats))
     return (g.means[:, None] + (R[:, None] * z[:, :, None]).sum(-1)).reshape(-1, 3)
 
@@ -48,7 +52,8 @@ class Walls:
         return at, ((at >= 0) & (at < self.size)).all(-1)
 
     def meet(self, origins: Tensor, ways: Tensor, chunk: int = 4096) -> Tensor:
-        """Distance [R] at which rays from origins [R, 3] along unit ways [R, 3] meet a wall, from two voxels on; inf where they do not."""
+        """Distance [R] at which rays from origins [R, 3] along unit ways [R, 3] meet a wall, from two voxels on; inf
+        where they do not."""
         steps = torch.arange(2 * self.cell, DEEPEST, self.cell / 2, dtype=torch.float64)
         out = []
         for o, w in zip(origins.double().split(chunk), ways.double().split(chunk), strict=True):
@@ -60,8 +65,8 @@ class Walls:
 
 @dataclass
 class Backdrop:
-    """What rays through patches meet behind them. points [P, 3]; of each ray its point [R], colour [R, 3] and patch [R]; boards: how many
-    were found between the patches and the walls."""
+    """What rays through patches meet behind them. points [P, 3]; of each ray its point [R], colour [R, 3] and patch
+    [R]; boards: how many were found between the patches and the walls."""
 
     points: Tensor
     where: Tensor
@@ -78,8 +83,8 @@ class Backdrop:
         return colour / count.clamp_min(1)[:, None], count > 0
 
     def gaussians(self, chosen: Tensor, bases: int) -> tuple[GaussianTensors, Tensor]:
-        """The backdrop as rays through the patches ``chosen`` [K] bool paint it, gaps in the colours beside them; ``bases`` of the SH. And
-        which of its Gaussians a ray fell on or beside."""
+        """The backdrop as rays through the patches ``chosen`` [K] bool paint it, gaps in the colours beside them;
+        ``bases`` of the SH. And which of its Gaussians a ray fell on or beside."""
         colour, painted = self.paint(chosen)
         keep, near = painted.clone(), painted.clone()
         if painted.any() and not painted.all():

@@ -1,7 +1,7 @@
 """What two reconstructed states say about space: seen through, surface, or hidden behind something.
 
-A point of one state that the other state's cameras look *through* has moved. A point with something in *front* of it is unknown,
-not moved: a cupboard's inside that appears when its door opens must not become a part.
+A point of one state that the other state's cameras look *through* has moved. A point with something in *front* of it is
+unknown, not moved: a cupboard's inside that appears when its door opens must not become a part.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ class StateEvidence:
     """One reconstructed state: a point cloud (the splat's centres) and rendered depth of its training views.
 
     points [N, 3]; colours [N, 3] in 0..1; normals [N, 3] or None; weights [N], e.g. opacity.
-    depths: V maps [H, W] float32, z along the camera, 0 where nothing; alphas: V maps [H, W]; cameras: V cameras of that size.
+    depths: V maps [H, W] float32, z along the camera, 0 where nothing; alphas: V maps [H, W]; cameras: V cameras of
+    that size.
     """
 
     points: Tensor
@@ -34,10 +35,11 @@ class StateEvidence:
 
 
 class DepthStack:
-    """The depth maps of one state as intervals: near/far [V, H, W] are 3x3 minimum and maximum; background is infinitely far.
+    """The depth maps of one state as intervals: near/far [V, H, W] are 3x3 minimum and maximum; background is
+    infinitely far.
 
-    The interval makes a depth edge count as surface, never as free space. Views of different size are padded to the largest.
-    Raises ValueError where a map and its camera differ in size.
+    The interval makes a depth edge count as surface, never as free space. Views of different size are padded to the
+    largest. Raises ValueError where a map and its camera differ in size.
     """
 
     def __init__(self, depths: Sequence[Tensor], alphas: Sequence[Tensor], cameras: Sequence[Camera]):
@@ -49,7 +51,9 @@ class DepthStack:
         H, W = max(h for h, _ in shapes), max(w for _, w in shapes)
 
         def stack(maps: Sequence[Tensor]) -> Tensor:
-            return torch.stack([torch.nn.functional.pad(m.float(), (0, W - m.shape[1], 0, H - m.shape[0])) for m in maps])
+            return torch.stack(
+                [torch.nn.functional.pad(m.float(), (0, W - m.shape[1], 0, H - m.shape[0])) for m in maps]
+            )
 
         self.size = torch.tensor(shapes)  # [V, 2] height, width
         self.depth = stack(depths)
@@ -60,7 +64,8 @@ class DepthStack:
         self.position = torch.stack([c.position for c in cameras]).float()
         R_t = self.viewmat[:, :3].reshape(-1, 12)
         K = self.K[:, [0, 1, 0, 1], [0, 1, 2, 2]]
-        self.rows = torch.cat([R_t, K, self.size.flip(1)], 1).float().contiguous()  # [V, 18] as the kernel reads cameras
+        # [V, 18] as the kernel reads cameras
+        self.rows = torch.cat([R_t, K, self.size.flip(1)], 1).float().contiguous()
         z = torch.where(self.valid, self.depth, torch.full_like(self.depth, torch.inf))[:, None]
         self.far = torch.nn.functional.max_pool2d(z, 3, 1, 1)[:, 0].contiguous()
         self.near = (-torch.nn.functional.max_pool2d(-z, 3, 1, 1)[:, 0]).contiguous()
@@ -115,7 +120,9 @@ class DepthStack:
         )  # fmt: skip
         return out
 
-    def counts_reference(self, points: Tensor, tau: float, views: Tensor, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, Tensor]:
+    def counts_reference(
+        self, points: Tensor, tau: float, views: Tensor, chunk: int = 1 << 20
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """``counts`` in torch, ``chunk`` points times views at once."""
         out = points.new_zeros(3, len(points))
         step = max(1, chunk // max(1, len(views)))
@@ -130,7 +137,8 @@ class DepthStack:
         return out[0], out[1], out[2]
 
     def seen_from(self, points: Tensor, tau: float) -> Tensor:
-        """Mean direction [N, 3] (unit; 0 where no view sees it) from each point to the cameras that see it on a surface.
+        """Mean direction [N, 3] (unit; 0 where no view sees it) from each point to the cameras that see it on a
+        surface.
 
         tau: tolerance along the ray, scene units.
         """
@@ -154,7 +162,8 @@ class DepthStack:
         return torch.nn.functional.normalize(out, dim=1)
 
     def excess(self, points: Tensor, tau: float, limit: float = 8.0) -> Tensor:
-        """Mean over the views that see past a point of how far they do, in units of tau, at most ``limit``; 0 where none does. [N]"""
+        """Mean over the views that see past a point of how far they do, in units of tau, at most ``limit``; 0 where
+        none does. [N]"""
         views = torch.arange(len(self))
         out = points.new_zeros(len(points))
         step = max(1, (1 << 20) // len(self))
@@ -163,12 +172,15 @@ class DepthStack:
             z, index, inside = self.project(points[i : i + step], views)
             past = (near[index] - z) / tau
             free = inside & (past > 1)
-            out[i : i + step] = torch.where(free, past.clamp_max(limit), torch.zeros_like(past)).sum(1) / free.sum(1).clamp_min(1)
+            out[i : i + step] = torch.where(free, past.clamp_max(limit), torch.zeros_like(past)).sum(1) / free.sum(
+                1
+            ).clamp_min(1)
         return out
 
 
 def classify(free: Tensor, on: Tensor, need: float = 3.0, ratio: float = 1.5) -> tuple[Tensor, Tensor]:
-    """Votes -> (moved, static): moved when at least ``need`` views see through and ``ratio`` times more than see a surface."""
+    """Votes -> (moved, static): moved when at least ``need`` views see through and ``ratio`` times more than see a
+    surface."""
     moved = (free >= need) & (free > ratio * on)
     static = (on >= 2) & (on > ratio * free)
     return moved, static

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from p2gs.context import RunContext
 from p2gs.gaussians.draw import render_gaussians
-from p2gs.motion.discovery import StateEvidence
 from p2gs.types import Camera, GaussianTensors, View
+from p2gs.visibility.depth_stack import StateEvidence
 
 
 @torch.no_grad()
@@ -19,8 +19,8 @@ def render_depths(
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Depth [H, W] (0 where the ray meets little) and alpha [H, W] of each camera.
 
-    The median depth (where the ray's transmittance passes one half) does not mix a front with what shows behind its edge, as
-    the mean does; where the rasterizer has none the mean is taken.
+    The median depth (where the ray's transmittance passes one half) does not mix a front with what shows behind its
+    edge, as the mean does; where the rasterizer has none the mean is taken.
     """
     depths, alphas = [], []
     g = g.to(device)
@@ -33,7 +33,8 @@ def render_depths(
 
 
 def object_window(view: View, size: int, margin: float = 0.06) -> Camera:
-    """The camera of a square window around the view's mask, ``size`` pixels wide: small objects get as many pixels as large ones."""
+    """The camera of a square window around the view's mask, ``size`` pixels wide: small objects get as many pixels as
+    large ones."""
     rows, cols = view.alpha.amax(1).nonzero().squeeze(1), view.alpha.amax(0).nonzero().squeeze(1)
     if rows.numel() == 0:
         return view.camera.scaled(size, size)
@@ -49,8 +50,8 @@ def gather_evidence(
 ) -> StateEvidence:
     """Evidence of one state: centres and colours of its solid Gaussians, depth and alpha maps of its training views.
 
-    size: side of the maps in pixels; each shows the object's window of its view. Gaussians below ``min_opacity`` are left out of
-    the points.
+    size: side of the maps in pixels; each shows the object's window of its view. Gaussians below ``min_opacity`` are
+    left out of the points.
     """
     from p2gs.ops.sh import dc_to_rgb
 

@@ -1,7 +1,7 @@
 """How much of each Gaussian some view sees.
 
-What fills the inside of a closed body explains no photograph of it, so nothing forms it; carried along when the body opens, it
-would stand in the other state's pictures as fog.
+What fills the inside of a closed body explains no photograph of it, so nothing forms it; carried along when the body
+opens, it would stand in the other state's pictures as fog.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ from p2gs.types import Camera, GaussianTensors
 
 
 def footprint(g: GaussianTensors, camera: Camera, pixels: Pixels = PIXELS["classic"]) -> Tensor:
-    """What each Gaussian alone would add to the image's alpha, summed over pixels: opacity * 2 pi sqrt(det of its 2D covariance), [N].
+    """What each Gaussian alone would add to the image's alpha, summed over pixels: opacity * 2 pi sqrt(det of its 2D
+    covariance), [N].
 
-    0 for what lies behind the camera. The covariance is the rasterizer's: EWA, ``pixels.eps2d`` added unless opacities fall by as much.
+    0 for what lies behind the camera. The covariance is the rasterizer's: EWA, ``pixels.eps2d`` added unless opacities
+    fall by as much.
     """
     W, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     p = g.means @ W.T + t
@@ -36,8 +38,11 @@ def footprint(g: GaussianTensors, camera: Camera, pixels: Pixels = PIXELS["class
     return torch.where(p[:, 2] > 0.01, area, torch.zeros_like(area))
 
 
-def visible_share(g: GaussianTensors, cameras: list[Camera], backend: str = "auto", device: torch.device | str = "cpu") -> Tensor:
-    """Greatest share of its footprint that any camera sees of each Gaussian (1: nothing in front; 0: hidden everywhere), [N] on the CPU.
+def visible_share(
+    g: GaussianTensors, cameras: list[Camera], backend: str = "auto", device: torch.device | str = "cpu"
+) -> Tensor:
+    """Greatest share of its footprint that any camera sees of each Gaussian (1: nothing in front; 0: hidden
+    everywhere), [N] on the CPU.
 
     A Gaussian's weight in an image, summed over pixels, is the derivative of a feature channel's sum by its feature.
     """

@@ -14,8 +14,8 @@ from p2gs.visibility.depth_stack import DepthStack, StateEvidence
 
 @dataclass
 class Surfels:
-    """points [N, 3]; normals [N, 3] unit, towards the cameras; colours [N, 3]; spacing: median distance to the 4th neighbour;
-    noise: robust standard deviation of the depth maps about the surfels, along the normal (scene units)."""
+    """points [N, 3]; normals [N, 3] unit, towards the cameras; colours [N, 3]; spacing: median distance to the 4th
+    neighbour; noise: robust standard deviation of the depth maps about the surfels, along the normal (scene units)."""
 
     points: Tensor
     normals: Tensor
@@ -30,17 +30,20 @@ class Surfels:
         return Surfels(self.points[index], self.normals[index], self.colours[index], self.spacing, self.noise)
 
 
-def window_planes(stack: DepthStack, view: Tensor, y: Tensor, x: Tensor, reach: float, radius: int = 2, block: int = 8192):
+def window_planes(
+    stack: DepthStack, view: Tensor, y: Tensor, x: Tensor, reach: float, radius: int = 2, block: int = 8192
+):
     """Plane through the (2r+1)^2 pixels about each given pixel, pixels farther than ``reach`` in depth faded out.
 
-    Returns point [M, 3] (the pixel's ray cut with the plane's mean depth) and normal [M, 3] towards the camera, both in world coordinates,
-    support [M] (pixels) and cosine [M] between normal and ray. Solved as a weighted regression of inverse depth, which is exact for a
-    plane seen in perspective.
+    Returns point [M, 3] (the pixel's ray cut with the plane's mean depth) and normal [M, 3] towards the camera, both in
+    world coordinates, support [M] (pixels) and cosine [M] between normal and ray. Solved as a weighted regression of
+    inverse depth, which is exact for a plane seen in perspective.
     block: pixels at a time, so that what lies between stays in the caches.
     """
     if len(view) > block:
         parts = [
-            window_planes(stack, *p, reach, radius, block) for p in zip(view.split(block), y.split(block), x.split(block), strict=True)
+            window_planes(stack, *p, reach, radius, block)
+            for p in zip(view.split(block), y.split(block), x.split(block), strict=True)
         ]
         return tuple(torch.cat(p) for p in zip(*parts, strict=True))
     H, W = stack.depth.shape[1:]
@@ -72,7 +75,8 @@ def window_planes(stack: DepthStack, view: Tensor, y: Tensor, x: Tensor, reach: 
 
 
 def view_planes(stack: DepthStack, reach: float, stride: int = 2) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What the depth maps say of surfaces: points [M, 3], normals [M, 3], the view [M] that saw them and how well [M] it did."""
+    """What the depth maps say of surfaces: points [M, 3], normals [M, 3], the view [M] that saw them and how well [M]
+    it did."""
     v, y, x = torch.nonzero(stack.valid[:, ::stride, ::stride], as_tuple=True)
     point, normal, support, cosine = window_planes(stack, v, y * stride, x * stride, reach)
     keep = (support > 7) & (cosine > 0.2)
@@ -109,8 +113,11 @@ def measure_noise(stack: DepthStack, points: Tensor, normals: Tensor, limit: flo
     return float(1.4826 * r[ok].abs().median()) if ok.any() else limit / 3
 
 
-def build_surfels(evidence: StateEvidence, stack: DepthStack, diag: float, target: int, floor: float) -> tuple[Surfels, dict]:
-    """Surfels of one state (at most about ``target``) and the figures of each step. diag: box diagonal; floor: least noise / diag."""
+def build_surfels(
+    evidence: StateEvidence, stack: DepthStack, diag: float, target: int, floor: float
+) -> tuple[Surfels, dict]:
+    """Surfels of one state (at most about ``target``) and the figures of each step. diag: box diagonal; floor: least
+    noise / diag."""
     cell, reach = 0.006 * diag, 0.02 * diag
     stride = 1 if int(stack.valid.sum()) < 12 * target else 2
     planes = view_planes(stack, reach, stride)
@@ -137,12 +144,19 @@ def build_surfels(evidence: StateEvidence, stack: DepthStack, diag: float, targe
     _, near = tree.query(points.numpy(), k=min(4, len(evidence.points)))
     colours = evidence.colours[torch.from_numpy(np.asarray(near).reshape(len(points), -1))].mean(1)
     noise = max(measure_noise(stack, points, normals, 0.04 * diag, some), floor * diag)
-    figures = {"surfels_raw": raw, "surfels": len(points), "cell": cell, "noise": noise, "spacing": float(np.median(d[:, 4]))}
+    figures = {
+        "surfels_raw": raw,
+        "surfels": len(points),
+        "cell": cell,
+        "noise": noise,
+        "spacing": float(np.median(d[:, 4])),
+    }
     return Surfels(points, normals, colours.float(), float(np.median(d[:, 4])), noise), figures
 
 
 def settle(points: Tensor, normals: Tensor, radius: float, k: int = 16, rounds: int = 2) -> tuple[Tensor, Tensor]:
-    """Smooth: average normals over neighbours that agree in side and plane, then move points 80 % of the way onto the local plane."""
+    """Smooth: average normals over neighbours that agree in side and plane, then move points 80 % of the way onto the
+    local plane."""
     _, idx = cKDTree(points.numpy()).query(points.numpy(), k=min(k, len(points)))
     idx = torch.from_numpy(idx)
     d = points[idx] - points[:, None]

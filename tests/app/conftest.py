@@ -30,7 +30,8 @@ class SecondConfig:
 
 @pytest.fixture
 def fakes(monkeypatch):
-    """Registries filled with: losses render, part, contact; callbacks progress, count; phases first, second; data folder, made."""
+    """Registries filled with: losses render, part, contact; callbacks progress, count; phases first, second; data
+    folder, made."""
     from p2gs.callbacks.base import CALLBACKS, Callback, register_callback
     from p2gs.config.run import run as config
     from p2gs.data.base import DATASETS

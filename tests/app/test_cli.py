@@ -39,7 +39,9 @@ def test_every_spelling_answers(command):
     assert wrong.stderr.startswith("error: config file 'nowhere.yaml' is not there") and wrong.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("words", [["--help"], ["version"], ["fit", "--help"], ["data", "check", "--help"], ["fitt"], []])
+@pytest.mark.parametrize(
+    "words", [["--help"], ["version"], ["fit", "--help"], ["data", "check", "--help"], ["fitt"], []]
+)
 def test_help_and_typos_do_not_wait_for_torch(words):
     code = f"""
 import sys
@@ -72,7 +74,9 @@ def test_mistakes_get_one_line(capsys, tmp_path):
 
 def test_lightning_words_that_are_not_ours_go_to_lightning_sdk(monkeypatch):
     seen = []
-    monkeypatch.setattr(cli, "_sdk_entry_point", lambda: SimpleNamespace(load=lambda: lambda: seen.append(list(sys.argv)) or 7))
+    monkeypatch.setattr(
+        cli, "_sdk_entry_point", lambda: SimpleNamespace(load=lambda: lambda: seen.append(list(sys.argv)) or 7)
+    )
     monkeypatch.setattr(sys, "argv", ["lightning"])
     assert cli.lightning_main(["studio", "list"]) == 7
     assert seen == [["lightning", "studio", "list"]]
@@ -88,7 +92,10 @@ def test_lightning_words_that_are_nobodys(monkeypatch, capsys):
 def test_the_sdk_entry_point_is_found_by_name(monkeypatch):
     from importlib import metadata
 
-    points = [SimpleNamespace(group="console_scripts", name="sandbox"), SimpleNamespace(group="console_scripts", name="lightning-sdk")]
+    points = [
+        SimpleNamespace(group="console_scripts", name="sandbox"),
+        SimpleNamespace(group="console_scripts", name="lightning-sdk"),
+    ]
 
     def fake(name):
         if name != "lightning-sdk":

@@ -50,7 +50,13 @@ def test_overlay_merges_deeply_and_null_switches_off(base, write):
 
 
 def test_command_line_overrides_one_field_and_switches_off(base):
-    words = ["--phases.second.losses.part.weight", "0.3", "--phases.second.losses.contact", "null", "--phases.first.levels=[50]"]
+    words = [
+        "--phases.second.losses.part.weight",
+        "0.3",
+        "--phases.second.losses.contact",
+        "null",
+        "--phases.first.levels=[50]",
+    ]
     cfg = load_config([base], words)
     losses = cfg.phases["second"].losses
     assert losses["part"].weight == 0.3 and losses["part"].temperature == 3 and "contact" not in losses
@@ -99,7 +105,10 @@ def test_overlay_still_reaches_a_phase_with_callbacks_of_its_own(base, write, tm
     cfg = load_config([base, own])
     save_config(cfg, tmp_path / "saved.yaml")
     again = load_config([tmp_path / "saved.yaml"], ["--callbacks.progress.every", "7"])
-    assert again.phases["second"].callbacks["progress"].every == 7 and again.phases["second"].callbacks["progress"].style == "dots"
+    assert (
+        again.phases["second"].callbacks["progress"].every == 7
+        and again.phases["second"].callbacks["progress"].style == "dots"
+    )
 
 
 def test_include_is_laid_below(base, write):
@@ -134,11 +143,15 @@ def test_data_without_root_or_format_is_told_when_needed(base):
 def test_format_is_found_from_the_folder(base, fakes, tmp_path, monkeypatch):
     (tmp_path / "box").mkdir()
     (tmp_path / "box" / "note.txt").touch()
-    with pytest.raises(UserError, match=r"data\.format is not given, and .*box looks like none of the layouts artgs, dta, paris"):
+    with pytest.raises(
+        UserError, match=r"data\.format is not given, and .*box looks like none of the layouts artgs, dta, paris"
+    ):
         load_config([base], ["--data.root", str(tmp_path / "box")])
     with pytest.raises(UserError, match=r"data\.root: the folder .*nowhere is not there"):
         load_config([base], ["--data.root", str(tmp_path / "nowhere")])
-    monkeypatch.setattr("p2gs.data.layouts.LAYOUTS", {"folder": SimpleNamespace(detect=lambda root: (root / "note.txt").is_file())})
+    monkeypatch.setattr(
+        "p2gs.data.layouts.LAYOUTS", {"folder": SimpleNamespace(detect=lambda root: (root / "note.txt").is_file())}
+    )
     cfg = load_config([base], ["--data.root", str(tmp_path / "box"), "--data.views", "4"])
     assert cfg.data_options["format"] == "folder" and cfg.data.views == 4
 
@@ -155,7 +168,12 @@ def test_section_for_hashing(base):
     def section(*overrides):
         return load_config([base], list(overrides)).section("second")
 
-    assert section() == section("--callbacks.progress.every", "99") == section("--phases.first.steps", "1") == section("--seed", "5")
+    assert (
+        section()
+        == section("--callbacks.progress.every", "99")
+        == section("--phases.first.steps", "1")
+        == section("--seed", "5")
+    )
     assert section() != section("--phases.second.losses.part.weight", "0.2")
     assert section() != section("--phases.second.callbacks.count", "{}")  # count changes the result
     assert section() != section("--phases.second.losses.contact", "null")
@@ -163,7 +181,9 @@ def test_section_for_hashing(base):
 
 
 def test_saved_config_reads_back_the_same(base, tmp_path):
-    cfg = load_config([base], ["--data.format", "folder", "--data.root", "x", "--phases.second.losses.contact", "null", "--seed", "8"])
+    cfg = load_config(
+        [base], ["--data.format", "folder", "--data.root", "x", "--phases.second.losses.contact", "null", "--seed", "8"]
+    )
     save_config(cfg, tmp_path / "run" / "config.yaml")
     stored = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
     assert set(stored["p2gs"]) == {"version", "git", "command"} and stored["seed"] == 8

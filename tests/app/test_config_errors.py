@@ -8,7 +8,10 @@ from p2gs.types import UserError
 MISTAKES = [
     (["--seeed", "1"], r"no option 'seeed' \(did you mean 'seed'\?\)"),
     (["--phases.secnd.steps", "1"], r"no option 'phases\.secnd' \(did you mean 'phases\.second'\?\)"),
-    (["--phases.second.losses.part.wieght", "1"], r"no option '.*part\.wieght' \(did you mean 'phases\.second\.losses\.part\.weight'\?\)"),
+    (
+        ["--phases.second.losses.part.wieght", "1"],
+        r"no option '.*part\.wieght' \(did you mean 'phases\.second\.losses\.part\.weight'\?\)",
+    ),
     (["--phases.second.losses.prt", "null"], r"did you mean 'phases\.second\.losses\.part'"),
     (["--second.losses.part.weight", "1"], r"no option 'second' \(did you mean 'phases\.second'\?\)"),
     (["--temperature", "1"], r"did you mean 'phases\.(first|second)\.losses\.part\.temperature'"),
@@ -22,7 +25,10 @@ MISTAKES = [
         ["--phases.first.rates", "null", "--phases.first.rates", "3"],
         r"phases\.first\.rates: expected options \(key: value\) or null, got '3'",
     ),
-    (["--phases.second.losses.part", "true"], r"phases\.second\.losses\.part: expected options \(key: value\) or null, got 'true'"),
+    (
+        ["--phases.second.losses.part", "true"],
+        r"phases\.second\.losses\.part: expected options \(key: value\) or null, got 'true'",
+    ),
     (["--phases.second.losses.part.variant", "letter"], r"expected one of paper, sane"),
     (["--device", "gpu"], r"device: expected one of auto, cpu, cuda, got 'gpu'"),
     (["--num_parts", "some"], r"num_parts: expected a whole number or 'auto', got 'some'"),
@@ -43,7 +49,10 @@ def test_mistakes_on_the_command_line(fakes, words, message):
 
 
 FILES = [
-    ("phases: {second: {losses: {prt: {}}}}", r"x\.yaml: no option '.*losses\.prt' \(did you mean 'phases\.second\.losses\.part'\?\)"),
+    (
+        "phases: {second: {losses: {prt: {}}}}",
+        r"x\.yaml: no option '.*losses\.prt' \(did you mean 'phases\.second\.losses\.part'\?\)",
+    ),
     ("seed: 1\nseed: 2", r"x\.yaml, line 2: the key 'seed' is given twice"),
     ("phases: {first: {steps: 3", r"x\.yaml, line \d: "),
     ("- 1", r"x\.yaml: expected a mapping"),

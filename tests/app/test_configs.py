@@ -16,14 +16,24 @@ def files(folder: str) -> list[str]:
 
 
 def test_the_folders_are_not_empty():
-    assert {f"preset/{name}.yaml" for name in ("cpu", "gpu", "paper", "paper_depth", "paper_literal", "smoke")} <= set(files("preset"))
+    assert {f"preset/{name}.yaml" for name in ("cpu", "gpu", "paper", "paper_depth", "paper_literal", "smoke")} <= set(
+        files("preset")
+    )
     assert {"data/paris.yaml", "data/dta.yaml", "data/artgs.yaml"} <= set(files("data")) and len(files("ablation")) >= 5
 
 
 @pytest.mark.parametrize("name", ["demo.yaml", *files("preset")])
 def test_presets_name_every_stage(name):
     cfg = load_config([name])
-    assert list(cfg.phases) == ["single_state", "registration", "discovery", "sharpen", "canonical_fusion", "articulation", "finish"]
+    assert list(cfg.phases) == [
+        "single_state",
+        "registration",
+        "discovery",
+        "sharpen",
+        "canonical_fusion",
+        "articulation",
+        "finish",
+    ]
     for phase in ("single_state", "canonical_fusion", "articulation"):
         assert "render" in cfg.phases[phase].losses
         assert {"progress", "scalars", "checkpoint", "evaluation"} <= set(cfg.phases[phase].callbacks)
@@ -46,7 +56,9 @@ def test_every_loss_and_callback_of_the_default_can_be_null():
 
 def test_the_paper_says_these_numbers():
     literal = load_config(["preset/paper_literal.yaml"])
-    assert literal.phases["single_state"].config.steps == 30000 and literal.phases["canonical_fusion"].config.steps == 5000
+    assert (
+        literal.phases["single_state"].config.steps == 30000 and literal.phases["canonical_fusion"].config.steps == 5000
+    )
     articulation = literal.phases["articulation"]
     weights = {name: loss.weight for name, loss in articulation.losses.items()}
     assert weights == {"render": 1.0, "part": 0.1, "art": 1.0, "contact": 0.5, "velocity": 0.5, "vector": 0.5}
@@ -65,7 +77,9 @@ def test_the_literal_preset_has_nothing_of_the_default_that_the_paper_has_not():
     assert articulation.config.repel.render and art.variant == "paper" and art.lambda_rot == 0.1
     for name in ("single_state", "canonical_fusion", "articulation"):
         phase = literal.phases[name]
-        assert len(phase.config.levels) == 1 and not {"alpha", "depth", "depth_variance", "flat", "planar"} & set(phase.losses)
+        assert len(phase.config.levels) == 1 and not {"alpha", "depth", "depth_variance", "flat", "planar"} & set(
+            phase.losses
+        )
     densify = literal.phases["single_state"].callbacks["densify"]
     assert densify.budget is None and densify.threshold > 0 and densify.reset_every == 3000
     canonical = literal.phases["canonical_fusion"].config.canonical
@@ -81,7 +95,9 @@ def test_depth_is_in_the_depth_preset_alone():
     paper, depth = load_config(["preset/paper.yaml"]), load_config(["preset/paper_depth.yaml"])
     trained = ("single_state", "sharpen", "canonical_fusion", "articulation")
     assert not any("depth" in paper.phases[n].losses for n in trained) and paper.data_options["depth"] == "never"
-    assert all(depth.phases[n].losses["depth"].weight == 1.0 for n in trained) and depth.data_options["depth"] == "always"
+    assert (
+        all(depth.phases[n].losses["depth"].weight == 1.0 for n in trained) and depth.data_options["depth"] == "always"
+    )
 
 
 def test_exact_parts_need_a_number():

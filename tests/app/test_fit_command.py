@@ -85,7 +85,12 @@ def test_a_plugin_by_flag_by_key_and_by_environment(fakes, pipeline, write, tmp_
     monkeypatch.chdir(tmp_path)
     on = "phases: {first: {losses: {mine: {k: 4}}}}\ndata: {format: made}\n"
     for n, (words, text, variable) in enumerate(
-        [(["--plugins", "own_a"], on, ""), ([], on + "plugins: [own_b]", ""), (["--plugins", "own_c.py"], on, ""), ([], on, "own_d")]
+        [
+            (["--plugins", "own_a"], on, ""),
+            ([], on + "plugins: [own_b]", ""),
+            (["--plugins", "own_c.py"], on, ""),
+            ([], on, "own_d"),
+        ]
     ):
         from p2gs.losses.base import LOSSES
 

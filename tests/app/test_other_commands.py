@@ -50,7 +50,12 @@ def test_predict_writes_a_picture_for_every_time(twin, tmp_path, capsys):
     run, _ = twin
     assert main(["predict", str(run), "--times", "0", "1.5", "--out", str(tmp_path / "p"), "--size", "48"]) == 0
     printed = capsys.readouterr().out.splitlines()
-    assert sorted(p.name for p in (tmp_path / "p").iterdir()) == ["parts_t0.000.png", "parts_t1.500.png", "t0.000.png", "t1.500.png"]
+    assert sorted(p.name for p in (tmp_path / "p").iterdir()) == [
+        "parts_t0.000.png",
+        "parts_t1.500.png",
+        "t0.000.png",
+        "t1.500.png",
+    ]
     assert len(printed) == 4 and max(cv2.imread(printed[0]).shape[:2]) == 48
     assert "at least 16 pixels" in failure(capsys, "predict", str(run), "--size", "3")
 
@@ -60,7 +65,9 @@ def test_test_needs_the_config_of_the_run(twin, capsys):
 
 
 def test_export_names_the_formats(twin, capsys):
-    assert "unknown export format 'urfd' (did you mean 'urdf'?)" in failure(capsys, "export", str(twin[0]), "--format", "urfd")
+    assert "unknown export format 'urfd' (did you mean 'urdf'?)" in failure(
+        capsys, "export", str(twin[0]), "--format", "urfd"
+    )
     assert "--scale: expected a positive number" in failure(capsys, "export", str(twin[0]), "--scale", "0")
 
 
@@ -103,7 +110,26 @@ def test_viewer_in_the_browser(twin):
 
 def test_data_synth_then_check(tmp_path, capsys):
     scene = tmp_path / "scene"
-    assert main(["data", "synth", str(scene), "--seed", "3", "--size", "48", "--views", "6", "--test_views", "2", "--kind", "demo"]) == 0
+    assert (
+        main(
+            [
+                "data",
+                "synth",
+                str(scene),
+                "--seed",
+                "3",
+                "--size",
+                "48",
+                "--views",
+                "6",
+                "--test_views",
+                "2",
+                "--kind",
+                "demo",
+            ]
+        )
+        == 0
+    )
     assert "--data.root" in capsys.readouterr().out
     assert main(["data", "check", str(scene)]) == 0
     assert "can be trained on" in capsys.readouterr().out
@@ -116,13 +142,16 @@ def test_data_synth_then_check(tmp_path, capsys):
 
 
 def test_test_scores_a_run_and_prints_it(twin, tmp_path, capsys):
-    """The hand-made twin against a generated scene: nonsense figures, but the whole way to metrics.json and the table."""
+    """The hand-made twin against a generated scene: nonsense figures, but the whole way to metrics.json and the
+    table."""
     import shutil
 
     run = tmp_path / "run"
     shutil.copytree(twin[0], run)
     scene = tmp_path / "scene"
-    assert main(["data", "synth", str(scene), "--size", "48", "--views", "6", "--test_views", "1", "--kind", "demo"]) == 0
+    assert (
+        main(["data", "synth", str(scene), "--size", "48", "--views", "6", "--test_views", "1", "--kind", "demo"]) == 0
+    )
     (run / "config.yaml").write_text(f"data: {{format: artgs, root: {scene}}}\n")
     (run / "report.html").write_text("as the fit left it")
     capsys.readouterr()

@@ -1,4 +1,5 @@
-"""Files of strangers: nothing is unpickled or run, names are no markup, the viewer is for this machine alone. SECURITY.md says the same."""
+"""Files of strangers: nothing is unpickled or run, names are no markup, the viewer is for this machine alone.
+SECURITY.md says the same."""
 
 import ast
 import inspect
@@ -42,7 +43,9 @@ def test_nothing_is_loaded_unrestricted():
         elif name == "yaml.load":
             loader = option(call, "Loader") or ""
             found.add(name)
-            wrong += [f"{path}: yaml.load with {loader or 'no loader'}"] * (loader != "_StrictLoader" and "SafeLoader" not in loader)
+            wrong += [f"{path}: yaml.load with {loader or 'no loader'}"] * (
+                loader != "_StrictLoader" and "SafeLoader" not in loader
+            )
         elif name in ("yaml.unsafe_load", "yaml.full_load", "eval", "exec", "os.system", "pickle.loads", "pickle.load"):
             wrong.append(f"{path}: {name}")
         elif name.startswith("subprocess."):
@@ -84,7 +87,9 @@ def test_a_checkpoint_that_would_run_something_is_damaged(tmp_path):
 
 def test_a_config_that_would_run_something_is_refused(tmp_path):
     proof = tmp_path / "ran"
-    (tmp_path / "bad.yaml").write_text(f"seed: !!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ['{proof}']]\n")
+    (tmp_path / "bad.yaml").write_text(
+        f"seed: !!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ['{proof}']]\n"
+    )
     with pytest.raises(UserError, match="bad.yaml, line 1: could not determine a constructor"):
         load_config([str(tmp_path / "bad.yaml")])
     assert not proof.exists()
@@ -141,7 +146,14 @@ def test_names_are_text_in_the_report(tmp_path):
 def test_a_part_is_no_markup(tmp_path):
     from p2gs.gaussians.twin_json import read_twin_json
 
-    joint = {"type": EVIL, "axis": [0, 0, 1], "origin": [0, 0, 0], "motion": 1, "limits": [0, 1], "transform": torch.eye(4).tolist()}
+    joint = {
+        "type": EVIL,
+        "axis": [0, 0, 1],
+        "origin": [0, 0, 0],
+        "motion": 1,
+        "limits": [0, 1],
+        "transform": torch.eye(4).tolist(),
+    }
     parts = [{"id": 0, "kind": "static"}, {"id": 1, "kind": "movable", "joint": joint}]
     (tmp_path / "twin.json").write_text(json.dumps({"format": "p2gs-twin/1", "canonical_time": 0.5, "parts": parts}))
     with pytest.raises(UserError, match="twin.json: part 1 cannot be read"):
@@ -151,7 +163,9 @@ def test_a_part_is_no_markup(tmp_path):
 def one_part():
     from p2gs.types import ArticulatedObject, Part
 
-    g = GaussianTensors(torch.rand(20, 3), torch.ones(20, 4), torch.full((20, 3), -3.0), torch.ones(20), torch.zeros(20, 1, 3))
+    g = GaussianTensors(
+        torch.rand(20, 3), torch.ones(20, 4), torch.full((20, 3), -3.0), torch.ones(20), torch.zeros(20, 1, 3)
+    )
     return ArticulatedObject(g, torch.zeros(20, dtype=torch.int64), [Part(0)], 0.0)
 
 

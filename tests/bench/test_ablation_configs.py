@@ -22,7 +22,12 @@ ROWS = {
     "tab:beta_ablation": ["beta_uniform", "beta_per_part", "beta_global"],
     "tab:repel_num_ablation": ["repel_count_500", "repel_count_2000", "repel_count_4000"],
     "tab:repel_noise_robustness": ["repel_noise_00", "repel_noise_01", "repel_noise_03", "repel_noise_05"],
-    "tab:fixed_dynamic_repel_per_object": ["repel_fixed_clean", "repel_dynamic_clean", "repel_fixed_noisy", "repel_dynamic_noisy"],
+    "tab:fixed_dynamic_repel_per_object": [
+        "repel_fixed_clean",
+        "repel_dynamic_clean",
+        "repel_fixed_noisy",
+        "repel_dynamic_noisy",
+    ],
     "tab:repel_exponent_ablation": ["repel_exponent_2", "repel_exponent_3", "repel_exponent_4"],
     "tab:k_ablation": ["k_2", "k_3", "k_4", "k_5", "k_6"],
     "tab:k_sensitivity": ["k_2", "k_4", "k_6", "k_5", "k_7", "k_9", "k_8", "k_11"],
@@ -96,14 +101,19 @@ def test_no_canonical_hands_over_the_start_state_as_it_is():
     def cloud(n, seed):
         r = torch.Generator().manual_seed(seed)
         means = torch.rand(n, 3, generator=r)
-        return GaussianTensors(means, torch.eye(4)[:1].repeat(n, 1), torch.zeros(n, 3), torch.full((n,), 3.0), torch.zeros(n, 1, 3))
+        return GaussianTensors(
+            means, torch.eye(4)[:1].repeat(n, 1), torch.zeros(n, 3), torch.full((n,), 3.0), torch.zeros(n, 1, 3)
+        )
 
     start, end = cloud(40, 0), cloud(30, 1)
     labels = [torch.arange(40) % 2, torch.arange(30) % 2]
-    motions = PartMotions(["free"], torch.eye(4).double()[None], torch.ones(1), labels, [torch.ones(40), torch.ones(30)])
+    motions = PartMotions(
+        ["free"], torch.eye(4).double()[None], torch.ones(1), labels, [torch.ones(40), torch.ones(30)]
+    )
     fused = fuse(start, end, motions, CanonicalConfig(fusion="none"))
     assert torch.equal(fused.gaussians.means, start.means) and torch.equal(fused.labels, labels[0])
-    assert not fused.paired.any() and torch.equal(fused.betas, torch.ones(2).double())  # canonical time 1 - beta = 0: the start
+    # canonical time 1 - beta = 0: the start
+    assert not fused.paired.any() and torch.equal(fused.betas, torch.ones(2).double())
 
 
 def test_the_dynamic_repel_points_follow_the_length_of_the_phase():

@@ -1,4 +1,5 @@
-"""Every ablation takes two steps of fusion and articulation, on the default and the literal preset, and runs what it is named for."""
+"""Every ablation takes two steps of fusion and articulation, on the default and the literal preset, and runs what it is
+named for."""
 
 from pathlib import Path
 
@@ -18,11 +19,29 @@ from p2gs.types import GaussianTensors, UserError
 NAMES = sorted(p.stem for p in (Path(__file__).parents[2] / "configs" / "ablation").glob("*.yaml"))
 PRESETS = ("cpu", "paper_literal")
 TINY = [
-    *("--data.format", "synthetic", "--data.kind", "demo", "--data.size", "48", "--data.train_views", "6", "--data.test_views", "1"),
+    *(
+        "--data.format",
+        "synthetic",
+        "--data.kind",
+        "demo",
+        "--data.size",
+        "48",
+        "--data.train_views",
+        "6",
+        "--data.test_views",
+        "1",
+    ),
     *("--device", "cpu", "--threads", "1", "--phases.canonical_fusion.canonical.match_size", "60"),
     *(w for name in ("single_state", "canonical_fusion", "articulation") for w in (f"--phases.{name}.levels", "[48]")),
-    *(w for name in ("single_state", "canonical_fusion", "articulation") for w in (f"--phases.{name}.level_starts", "[0.0]")),
-    *("--callbacks", "{checkpoint: null, scalars: null, images: null, previews: null, evaluation: null, families: null, progress: null}"),
+    *(
+        w
+        for name in ("single_state", "canonical_fusion", "articulation")
+        for w in (f"--phases.{name}.level_starts", "[0.0]")
+    ),
+    *(
+        "--callbacks",
+        "{checkpoint: null, scalars: null, images: null, previews: null, evaluation: null, families: null, progress: null}",
+    ),
 ]
 
 
@@ -40,7 +59,9 @@ def states_and_motions(parts: int = 2) -> tuple[list[StateGaussians], PartMotion
     n = 240
     means = torch.rand(n, 3, generator=r) * 1.2 - 0.6
     labels = torch.arange(n) % (parts + 1)
-    T = [se3.make(torch.eye(3).double(), torch.tensor([0.1 * (k + 1), 0.05 * k, 0.0]).double()) for k in range(parts - 1)]
+    T = [
+        se3.make(torch.eye(3).double(), torch.tensor([0.1 * (k + 1), 0.05 * k, 0.0]).double()) for k in range(parts - 1)
+    ]
     T.append(se3.from_screw(torch.tensor([0.0, 0, 1]).double(), torch.tensor([0.3, 0.3, 0]).double(), 0.4))
     T = torch.stack(T)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
@@ -49,16 +70,20 @@ def states_and_motions(parts: int = 2) -> tuple[list[StateGaussians], PartMotion
     for k in range(parts):
         end[labels == k + 1] = se3.apply(T[k], means[labels == k + 1].double()).float()
     states = [
-        StateGaussians(s, GaussianTensors(x, quats, torch.full((n, 3), -3.0), torch.full((n,), 3.0), sh)) for s, x in ((0, means), (1, end))
+        StateGaussians(s, GaussianTensors(x, quats, torch.full((n, 3), -3.0), torch.full((n,), 3.0), sh))
+        for s, x in ((0, means), (1, end))
     ]
     types = ["prismatic"] * (parts - 1) + ["revolute"]
     return states, PartMotions(types, T, torch.ones(parts), [labels, labels], [torch.ones(n), torch.ones(n)])
 
 
-def run_two_steps(preset: str, name: str, scene: str, run: Path, *words: str) -> tuple[Pipeline, ArticulationPhase, handover.Articulation]:
+def run_two_steps(
+    preset: str, name: str, scene: str, run: Path, *words: str
+) -> tuple[Pipeline, ArticulationPhase, handover.Articulation]:
     """Pipeline, trained phase, and what it handed over.
 
-    Fusion and articulation of a config, two steps each where it takes steps at all, from reconstructions and motions that are given.
+    Fusion and articulation of a config, two steps each where it takes steps at all, from reconstructions and motions
+    that are given.
     """
     words = ["--data.root", scene, "--run", str(run), *TINY, *words]
     plain = load_config([f"preset/{preset}.yaml", f"ablation/{name}.yaml"], words)
@@ -137,7 +162,10 @@ def test_losses_that_would_vanish_are_named(scene, tmp_path):
 def test_beta_per_part_without_parts_takes_motion_clusters():
     states, motions = states_and_motions()
     options = {"correspondence": "hungarian", "fusion": "paper", "match_size": 500, "min_opacity": 0.0}
-    fused = {b: fuse(*(s.gaussians for s in states), None, CanonicalConfig(beta=b, **options), num_parts=3) for b in ("global", "per_part")}
+    fused = {
+        b: fuse(*(s.gaussians for s in states), None, CanonicalConfig(beta=b, **options), num_parts=3)
+        for b in ("global", "per_part")
+    }
     a, b = (f.gaussians.means for f in fused.values())
     assert a.shape == b.shape and not torch.allclose(a, b)
     with pytest.raises(UserError, match="their number"):
@@ -146,6 +174,10 @@ def test_beta_per_part_without_parts_takes_motion_clusters():
 
 def test_the_force_is_drawn_in_training_only(scene, tmp_path):
     _, phase, _ = run_two_steps("paper_literal", "full", scene, tmp_path / "a")
-    assert phase.config.repel.render and len(phase.repel_points) and phase.repel_force(phase.splats.means, 0).abs().max() > 0
+    assert (
+        phase.config.repel.render
+        and len(phase.repel_points)
+        and phase.repel_force(phase.splats.means, 0).abs().max() > 0
+    )
     with pytest.raises(UserError, match="render: false"):
         run_two_steps("paper_literal", "full", scene, tmp_path / "b", "--phases.articulation.losses.art", "null")

@@ -27,10 +27,22 @@ def bench(tmp_path):
 
 def test_two_of_three_seeds_solve_an_opening(bench):
     good, bad = (0.2, 0.9), (0.2, 1.1)
-    folder = bench({("ours", 5): [good] * 3, ("ours", 30): [good, None, good], ("ours", 60): [good, bad, None], ("random", 5): [bad] * 3})
+    folder = bench(
+        {
+            ("ours", 5): [good] * 3,
+            ("ours", 30): [good, None, good],
+            ("ours", 60): [good, bad, None],
+            ("random", 5): [bad] * 3,
+        }
+    )
     found = outcomes(folder)
-    assert basin([r for r in found if r.setting == "ours"]) == 30 and basin([r for r in found if r.setting == "random"]) is None
-    assert "| ours | 3 of 3 | 2 of 3 | 1 of 3 | 30 deg |" in markdown(found) and "| random | 0 of 3 |  |  | none |" in markdown(found)
+    assert (
+        basin([r for r in found if r.setting == "ours"]) == 30
+        and basin([r for r in found if r.setting == "random"]) is None
+    )
+    assert "| ours | 3 of 3 | 2 of 3 | 1 of 3 | 30 deg |" in markdown(
+        found
+    ) and "| random | 0 of 3 |  |  | none |" in markdown(found)
     assert main([str(folder)]) == 0 and (folder / "tables" / "basin.md").read_text() == markdown(found)
     assert len((folder / "tables" / "basin.csv").read_text().splitlines()) == 1 + len(found)
 

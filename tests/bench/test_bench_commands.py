@@ -9,11 +9,26 @@ ONE = "settings: {full: {}}\nseeds: [0]\n"
 
 
 def test_dry_run_prints_the_commands_and_runs_nothing(bench_file, tmp_path, capsys):
-    words = ["bench", "-c", bench_file(ONE), "--objects", "laptop", "--seeds", "4", "5", "--out", str(tmp_path / "o"), "--dry_run"]
+    words = [
+        "bench",
+        "-c",
+        bench_file(ONE),
+        "--objects",
+        "laptop",
+        "--seeds",
+        "4",
+        "5",
+        "--out",
+        str(tmp_path / "o"),
+        "--dry_run",
+    ]
     assert run([*words, "--phases.single_state.steps", "9"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(": ")[0] for line in lines] == ["laptop full seed 4", "laptop full seed 5"]
-    assert all(f"--phases.single_state.steps 9 --run {tmp_path / 'o'}" in line for line in lines) and not (tmp_path / "o").exists()
+    assert (
+        all(f"--phases.single_state.steps 9 --run {tmp_path / 'o'}" in line for line in lines)
+        and not (tmp_path / "o").exists()
+    )
 
 
 def test_a_bench_that_has_failures_says_so_by_its_exit_code(bench_file, program, monkeypatch, capsys):
@@ -33,7 +48,10 @@ def test_mistakes_are_one_line(bench_file, capsys, tmp_path):
     for words, told in (
         (["bench"], "bench needs a file"),
         (["bench", "-c", "bench/pariss.yaml"], "did you mean 'bench/paris.yaml'?"),
-        (["bench", "-c", bench_file(ONE), "--phases.articulation.stepps", "3"], "no option 'phases.articulation.stepps'"),
+        (
+            ["bench", "-c", bench_file(ONE), "--phases.articulation.stepps", "3"],
+            "no option 'phases.articulation.stepps'",
+        ),
         (["bench", "-c", bench_file(ONE), "--executor", "slrum"], "one of local, slurm, ray"),
         (["table", str(tmp_path / "nothing")], "no result folder of p2gs bench"),
     ):

@@ -19,13 +19,20 @@ def blocks(kind: str) -> list[str]:
 
 
 def commands() -> list[str]:
-    return [line.split("#")[0].strip() for block in blocks("bash") for line in block.splitlines() if line.startswith("p2gs")]
+    return [
+        line.split("#")[0].strip() for block in blocks("bash") for line in block.splitlines() if line.startswith("p2gs")
+    ]
 
 
 @pytest.mark.parametrize("command", commands())
 def test_commands_parse(command):
     args, rest = parser().parse_known_args(shlex.split(command)[1:])
-    assert not rest or args.command in ("fit", "bench") and rest[0].startswith("--phases.") or rest[0].startswith("--data.")
+    assert (
+        not rest
+        or args.command in ("fit", "bench")
+        and rest[0].startswith("--phases.")
+        or rest[0].startswith("--data.")
+    )
     for name in getattr(args, "config", []):
         assert (Path(__file__).parents[2] / "configs" / name).is_file(), name
 
@@ -38,7 +45,9 @@ def test_the_yaml_is_read(tree, tmp_path):
     assert len(bench.cells) == 4 * 2 * 3
     for cluster in blocks("yaml")[1:]:
         (tmp_path / "cluster.yaml").write_text(cluster)
-        options = read_bench([str(tmp_path / "bench.yaml"), str(tmp_path / "cluster.yaml")], ["--root", str(tree)]).options
+        options = read_bench(
+            [str(tmp_path / "bench.yaml"), str(tmp_path / "cluster.yaml")], ["--root", str(tree)]
+        ).options
         assert options.executor in yaml.safe_load(cluster).values()
 
 

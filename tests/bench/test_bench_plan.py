@@ -25,7 +25,9 @@ def test_the_matrix_is_objects_times_settings_times_seeds(bench_file, tree, tmp_
     words = "-c preset/cpu.yaml -c ablation/no_repel.yaml --data.root {} --data.format artgs --seed 3 --num_parts 4"
     words += " --phases.single_state.steps 5 --phases.articulation.steps 7"
     assert " ".join(last.words) == words.format(tree / "laptop")
-    assert last.donors == (str(tmp_path / "out" / "runs" / "full" / "laptop" / "seed3"),) and bench.cells[0].donors == ()
+    assert (
+        last.donors == (str(tmp_path / "out" / "runs" / "full" / "laptop" / "seed3"),) and bench.cells[0].donors == ()
+    )
     assert len({c.key for c in bench.cells}) == len({c.run for c in bench.cells}) == 8
     bench.check_settings()
 
@@ -133,14 +135,18 @@ def test_every_benchmark_object_is_a_column_of_the_paper():
     lists = benchmarks()
     assert [len(lists[n]) for n in ("paris", "dta_multi", "artgs_multi")] == [12, 2, 5]
     assert [o.column for o in lists["paris"]] == paper_table("main_result").objects
-    assert {o.column for o in (*lists["dta_multi"], *lists["artgs_multi"])} == set(paper_table("complex_main_result").objects)
+    assert {o.column for o in (*lists["dta_multi"], *lists["artgs_multi"])} == set(
+        paper_table("complex_main_result").objects
+    )
     for o in (*lists["dta_multi"], *lists["artgs_multi"]):
         assert f"({o.parts} parts)" in o.column, o.id
 
 
 def test_a_bench_takes_another_preset_and_says_which(bench_file, tmp_path):
     text = "config: [preset/cpu.yaml, preset/../base.yaml]\nsettings: {full: {}, two: {num_parts: 2}}\nseeds: [0]\n"
-    plain, literal = (read_bench([bench_file(text)], words) for words in ((), ("--preset", "paper_literal", "--num_parts", "gt")))
+    plain, literal = (
+        read_bench([bench_file(text)], words) for words in ((), ("--preset", "paper_literal", "--num_parts", "gt"))
+    )
     assert plain.options.presets == ["cpu"] and literal.options.presets == ["paper_literal"]
     assert literal.cells[0].words[:4] == ("-c", "preset/paper_literal.yaml", "-c", "preset/../base.yaml")
     given = {c.setting: c.words[c.words.index("--num_parts") + 1] for c in literal.cells if c.object == "cabinet"}

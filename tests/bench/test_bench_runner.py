@@ -1,4 +1,5 @@
-"""Running a bench: every run in its own process and folder, failures noted and not fatal, killed benches go on, three executors."""
+"""Running a bench: every run in its own process and folder, failures noted and not fatal, killed benches go on, three
+executors."""
 
 import io
 import json
@@ -56,7 +57,8 @@ def test_a_run_takes_over_finished_stages_of_the_settings_before(bench_file, pro
     for cell in bench.cells:
         assert (Path(cell.run) / "checkpoints" / "single_state_0.pt").read_text() == f"made in {first[cell.object]}"
     alone = read_bench(
-        [bench_file("settings: {full: {}, no_repel: {}}\nseeds: [0]\nreuse: false\n")], ["--out", str(bench.options.folder) + "2"]
+        [bench_file("settings: {full: {}, no_repel: {}}\nseeds: [0]\nreuse: false\n")],
+        ["--out", str(bench.options.folder) + "2"],
     )
     run(alone, program)
     for cell in alone.cells:
@@ -166,10 +168,15 @@ def test_the_live_matrix_has_a_sign_a_run_and_the_time_left(bench_file):
         console = Console(file=io.StringIO(), width=100)
         console.print(show.matrix())
     lines = console.file.getvalue().splitlines()
-    assert any(line.split() == ["cabinet", "●F", "··"] for line in lines) and any(line.split() == ["laptop", "▶·", "··"] for line in lines)
-    assert "2/8 runs, about 2:55 left" in console.file.getvalue() and "the sky fell" in console.file.getvalue()  # (5 * 60 + 50) / 2
+    assert any(line.split() == ["cabinet", "●F", "··"] for line in lines) and any(
+        line.split() == ["laptop", "▶·", "··"] for line in lines
+    )
+    # (5 * 60 + 50) / 2
+    assert "2/8 runs, about 2:55 left" in console.file.getvalue() and "the sky fell" in console.file.getvalue()
 
 
+#
+#
 # -- clusters ----------------------------------------------------------------------------------------------------------------------
 
 
@@ -177,7 +184,9 @@ def test_the_live_matrix_has_a_sign_a_run_and_the_time_left(bench_file):
 def test_slurm_by_submitits_own_executors(bench_file, program, monkeypatch, cluster):
     pytest.importorskip("submitit")
     monkeypatch.setenv("FAKE_P2GS_FAIL", "laptop")
-    bench = read_bench([bench_file(f"{ONE}executor: slurm\nslurm: {{cluster: {cluster}, jobs: 2, cpus: 3, minutes: 5}}\n")])
+    bench = read_bench(
+        [bench_file(f"{ONE}executor: slurm\nslurm: {{cluster: {cluster}, jobs: 2, cpus: 3, minutes: 5}}\n")]
+    )
     counts, _ = run(bench, program)
     assert counts == {"done": 1, "failed": 1}
     assert read_record(bench.cells[1].run)["error"] == "the sky fell" and "--threads 3" in program.calls("fit")[0]

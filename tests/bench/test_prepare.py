@@ -12,7 +12,8 @@ from p2gs.types import UserError
 
 @pytest.fixture
 def tree(tmp_path, scenes, write_scene):
-    """A tree that has blade_103706 in the PARIS layout (whole), table_25493 without cameras, and oven_101908 with wrong joints."""
+    """A tree that has blade_103706 in the PARIS layout (whole), table_25493 without cameras, and oven_101908 with wrong
+    joints."""
     for part in ("load", "data"):
         inner = scenes / "paris" / "blade" / part
         target = tmp_path / "paris" / part / "sapien" / "103706"
@@ -23,10 +24,17 @@ def tree(tmp_path, scenes, write_scene):
 
 
 def test_names():
-    assert [o.id for o in pick_objects(["dta_multi", "blade_103706", "fridge_10489"])] == ["fridge_10489", "storage_47254", "blade_103706"]
+    assert [o.id for o in pick_objects(["dta_multi", "blade_103706", "fridge_10489"])] == [
+        "fridge_10489",
+        "storage_47254",
+        "blade_103706",
+    ]
     assert len(pick_objects(["all"])) == 19
     table = pick_objects(["table_31249"])[0]
-    assert (table.parts, table.joints) == (5, ("prismatic", "revolute", "prismatic", "revolute")) and table.column == "Table (5 parts)"
+    assert (table.parts, table.joints) == (
+        5,
+        ("prismatic", "revolute", "prismatic", "revolute"),
+    ) and table.column == "Table (5 parts)"
     with pytest.raises(UserError, match="no benchmark or object 'blade_103705' \\(did you mean 'blade_103706'"):
         pick_objects(["blade_103705"])
 
@@ -48,7 +56,8 @@ def test_what_is_missing_is_said(tree, capsys):
     assert "has joints revolute, revolute, prismatic, the list says revolute, revolute, revolute" in oven
     assert "lacks the mesh of the whole, the static part, the moving parts" in oven
     assert any("transforms_train_end.json" in text for text in found["table_25493"].problems)
-    assert found["storage_45503"].where is None and not found["blade_103706"].ready  # most of its images were not copied
+    # most of its images were not copied
+    assert found["storage_45503"].where is None and not found["blade_103706"].ready
     text = "\n".join(prepare_lines(list(found.values())))
     assert "0 of 6 objects are ready; not there: table_31249, storage_45503, storage_47648" in text
     assert "more problems (p2gs data check" in text

@@ -1,4 +1,5 @@
-"""The paper's numbers as data, a few checked by hand against the paper, and the contradictions that the footnotes tell."""
+"""The paper's numbers as data, a few checked by hand against the paper, and the contradictions that the footnotes
+tell."""
 
 import statistics
 
@@ -86,7 +87,14 @@ def test_dashes_and_failures():
 
 
 def test_the_marked_numbers_are_the_best_but_where_a_footnote_says_otherwise():
-    for name in ("main_result", "complex_main_result", "main_ablation_v2", "beta_ablation", "k_sensitivity", "photometric_eval"):
+    for name in (
+        "main_result",
+        "complex_main_result",
+        "main_ablation_v2",
+        "beta_ablation",
+        "k_sensitivity",
+        "photometric_eval",
+    ):
         table = paper_table(name)
         for p in table.numbers.values():
             if p.marked != "best" or p.value is None:
@@ -112,7 +120,10 @@ def test_the_contradictions_are_real():
     assert value("repel_noise_robustness", "sigma 0.00", "Table (5 parts)", "ang") == 0.30
     assert value("k_sensitivity", "K_GT", "Table (5 parts)", "ang") == 0.03
     assert value("complex_main_result", "Part2GS", "Table (5 parts)", "ang") == 0.03
-    without, full = (value("main_ablation", row, "Storage (7 parts)", "motion") for row in ("- physical constraints", "Part2GS (all)"))
+    without, full = (
+        value("main_ablation", row, "Storage (7 parts)", "motion")
+        for row in ("- physical constraints", "Part2GS (all)")
+    )
     assert without < full
     ours = [p for t in (main, multi) for p in t.numbers.values() if p.row == "Part2GS"]
     assert statistics.mean(p.value for p in ours if p.metric == "cd_whole") == pytest.approx(1.13, abs=0.005)

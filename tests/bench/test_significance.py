@@ -27,7 +27,9 @@ def test_a_verdict_is_scipys():
         theirs = table.numbers.get(("ArtGS", object, metric))
         if row != "Part2GS" or mine.value is None or not (mine.std and theirs.std):
             continue
-        p = scipy_stats.ttest_ind_from_stats(mine.value, mine.std, 3, theirs.value, theirs.std, 3, equal_var=False).pvalue
+        p = scipy_stats.ttest_ind_from_stats(
+            mine.value, mine.std, 3, theirs.value, theirs.std, 3, equal_var=False
+        ).pvalue
         expected = "no difference" if p >= 0.05 else "better" if mine.value < theirs.value else "worse"
         assert verdicts[object, metric] == expected, (object, metric)
 

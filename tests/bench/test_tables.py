@@ -42,7 +42,8 @@ def drawn(monkeypatch, request):
 
 @pytest.fixture
 def bench(tmp_path):
-    """``bench(tables, {(setting, object id, column, parts): [metrics of each seed, or an error's text]})`` -> the folder."""
+    """``bench(tables, {(setting, object id, column, parts): [metrics of each seed, or an error's text]})`` -> the
+    folder."""
 
     def make(tables, runs):
         cells, scenes = [], {}
@@ -59,7 +60,13 @@ def bench(tmp_path):
                     (folder / "metrics.json").write_text(json.dumps(result))
                     (folder / "logs" / "stages.json").write_text(json.dumps({"a": {"seconds": 90.0}}))
                 cells.append({"object": object, "setting": setting, "seed": seed, "run": str(where)})
-        about = {"name": "b", "tables": tables, "scenes": list(scenes.values()), "cells": cells, "p2gs": {"version": "1"}}
+        about = {
+            "name": "b",
+            "tables": tables,
+            "scenes": list(scenes.values()),
+            "cells": cells,
+            "p2gs": {"version": "1"},
+        }
         (tmp_path / "cells.json").write_text(json.dumps(about))
         return tmp_path
 
@@ -87,13 +94,20 @@ def read(folder, name="main_result"):
 def test_mean_spread_best_floor_and_dashes_beside_the_published_rows(bench):
     blade = [scores(a, ("prismatic",)) for a in (0.03, 0.05)]
     folder = bench(
-        ["main_result"], {("full", "fold", "Foldchair", 2): [scores(0.002, ("revolute",))], ("full", "blade", "Blade", 2): blade}
+        ["main_result"],
+        {("full", "fold", "Foldchair", 2): [scores(0.002, ("revolute",))], ("full", "blade", "Blade", 2): blade},
     )
     rows = table_of(read(folder))
-    assert rows["Ang Err", "p2gs"]["Foldchair"] == "**0.00**" and rows["Ang Err", "Part2GS"]["Foldchair"] == "0.01 ± 0.00"
-    assert rows["Ang Err", "p2gs"]["Blade"] == "0.04 ± 0.01" and rows["Ang Err", "Part2GS"]["Blade"] == "**0.01 ± 0.00**"
     assert (
-        rows["Pos Err", "p2gs"]["Blade"] == "-" and rows["Pos Err", "Ditto"]["Blade"] == "-" and rows["Motion Err", "Ditto"]["Blade"] == "F"
+        rows["Ang Err", "p2gs"]["Foldchair"] == "**0.00**" and rows["Ang Err", "Part2GS"]["Foldchair"] == "0.01 ± 0.00"
+    )
+    assert (
+        rows["Ang Err", "p2gs"]["Blade"] == "0.04 ± 0.01" and rows["Ang Err", "Part2GS"]["Blade"] == "**0.01 ± 0.00**"
+    )
+    assert (
+        rows["Pos Err", "p2gs"]["Blade"] == "-"
+        and rows["Pos Err", "Ditto"]["Blade"] == "-"
+        and rows["Motion Err", "Ditto"]["Blade"] == "F"
     )
     assert rows["CD whole", "sampling floor"]["Blade"] == "*0.21*" and rows["Ang Err", "p2gs"]["Oven"] == ""
     assert list(rows["Ang Err", "p2gs"]) == paper_table("main_result").objects
@@ -104,7 +118,8 @@ def test_joints_that_were_not_found_are_counted_and_do_not_compete(bench):
     lost = scores(None, failures=2, cd=None)
     lost["joints"] |= {"pos_mean_artgs": None, "motion_mean": None}
     folder = bench(
-        ["complex_main_result"], {("full", "f", "Fridge (3 parts)", 3): runs, ("full", "s", "Storage (3 parts)", 3): [lost, lost]}
+        ["complex_main_result"],
+        {("full", "f", "Fridge (3 parts)", 3): runs, ("full", "s", "Storage (3 parts)", 3): [lost, lost]},
     )
     text = read(folder, "complex_main_result")
     rows = table_of(text)
@@ -179,7 +194,8 @@ def test_plots_are_drawn(bench):
     import cv2
 
     folder = bench(
-        ["main_ablation"], {(s, "t", "Table (5 parts)", 5): [scores(a), scores(2 * a)] for s, a in (("full", 0.02), ("no_part", 0.4))}
+        ["main_ablation"],
+        {(s, "t", "Table (5 parts)", 5): [scores(a), scores(2 * a)] for s, a in (("full", 0.02), ("no_part", 0.4))},
     )
     files = write_tables(folder)
     picture = cv2.imread(str(next(p for p in files if p.name == "main_ablation.png")))
@@ -191,11 +207,15 @@ def test_mistakes_are_told(bench, tmp_path):
     with pytest.raises(UserError, match="no result folder of p2gs bench"):
         write_tables(tmp_path)
     folder = bench([], {("full", "x", "x", 2): [scores()]})
-    with pytest.raises(UserError, match="beta_ablation: its rows are the settings beta_uniform, .* this bench has full"):
+    with pytest.raises(
+        UserError, match="beta_ablation: its rows are the settings beta_uniform, .* this bench has full"
+    ):
         write_tables(folder, ["beta_ablation"])
     assert (folder / "tables").exists() is False
 
 
+#
+#
 # -- statistics --------------------------------------------------------------------------------------------------------------------
 
 
@@ -237,9 +257,17 @@ def test_a_setting_that_loses_joints_is_not_tested(bench):
     good, bad = [scores(0.05), scores(0.06)], [scores(0.01), scores(0.01, failures=1)]
     folder = bench(
         ["main_ablation"],
-        {("full", "x", "x", 3): good, ("no_part", "x", "x", 3): bad, ("no_phys", "x", "x", 3): [scores(0.9), scores(0.91)]},
+        {
+            ("full", "x", "x", 3): good,
+            ("no_part", "x", "x", 3): bad,
+            ("no_phys", "x", "x", 3): [scores(0.9), scores(0.91)],
+        },
     )
     write_tables(folder)
     with open(folder / "tables" / "tests.csv") as file:
         tests = {(t["a"], t["metric"]): t["verdict"] for t in csv.DictReader(file)}
-    assert tests["p2gs no_phys", "ang"] == "worse" and ("p2gs no_part", "ang") not in tests and ("p2gs no_part", "cd_whole") in tests
+    assert (
+        tests["p2gs no_phys", "ang"] == "worse"
+        and ("p2gs no_part", "ang") not in tests
+        and ("p2gs no_part", "cd_whole") in tests
+    )

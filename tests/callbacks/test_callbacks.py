@@ -1,4 +1,5 @@
-"""Built-in callbacks on a tiny phase that fits a vector: what they write, when, and that none of them changes the result."""
+"""Built-in callbacks on a tiny phase that fits a vector: what they write, when, and that none of them changes the
+result."""
 
 import json
 import time
@@ -108,7 +109,14 @@ def test_register_makes_a_dataclass_that_lightning_takes(tmp_path, monkeypatch):
 def test_no_builtin_that_watches_changes_the_result(tmp_path):
     plain = train(tmp_path / "a")
     watched = train(
-        tmp_path / "b", Progress(), Scalars(every=2), Images(every=5), Previews(every=5), Checkpoint(every=3), Evaluation(), logger=True
+        tmp_path / "b",
+        Progress(),
+        Scalars(every=2),
+        Images(every=5),
+        Previews(every=5),
+        Checkpoint(every=3),
+        Evaluation(),
+        logger=True,
     )
     assert torch.equal(plain.x, watched.x)
     for name in ("progress", "scalars", "images", "previews", "checkpoint", "evaluation"):
@@ -184,7 +192,10 @@ def test_status_line_and_duration():
         num_gaussians=20345,
         scalars={"loss/total": torch.tensor(0.5), "loss/render": 0.125, "loss/part": torch.tensor(0.375)},
     )
-    assert status_line(phase, 50.0) == "articulation 250/1000  loss 0.5000  part 0.3750  render 0.1250  20,345 Gaussians  50/s  0:15 left"
+    assert (
+        status_line(phase, 50.0)
+        == "articulation 250/1000  loss 0.5000  part 0.3750  render 0.1250  20,345 Gaussians  50/s  0:15 left"
+    )
     assert "part" not in status_line(phase, 50.0, losses=0)
     assert duration(7.4) == "0:07" and duration(3723) == "1:02:03"
 
@@ -242,7 +253,8 @@ def test_lightning_is_silent(tmp_path, capfd):
 
 
 def test_evaluation_finds_ground_truth_and_logs_joint_errors(tmp_path):
-    """A door that the phase has learned 1 degree short, in internal units of another scale and place than the input's."""
+    """A door that the phase has learned 1 degree short, in internal units of another scale and place than the
+    input's."""
     import math
 
     from p2gs.gaussians.handover import Articulation
@@ -263,7 +275,9 @@ def test_evaluation_finds_ground_truth_and_logs_joint_errors(tmp_path):
     phase = TinyPhase()
     phase.screws, phase.hand_over = None, lambda: learned
     evaluation = Evaluation(every=5)
-    cfg = SimpleNamespace(data=SimpleNamespace(root=str(tmp_path)), data_options={"format": "artgs", "root": str(tmp_path)})
+    cfg = SimpleNamespace(
+        data=SimpleNamespace(root=str(tmp_path)), data_options={"format": "artgs", "root": str(tmp_path)}
+    )
     evaluation.prepare(cfg, SimpleNamespace(similarity=similarity))
     before = learned.transforms.clone()
     train(tmp_path / "run", evaluation, phase=phase, logger=True)

@@ -13,7 +13,12 @@ METRICS = {
     "num_parts": 4,
     "gaussians": 10,
     "joints": {"failures": 1, "axis_angle_mean": 0.25, "pos_mean_artgs": None, "joints": []},
-    "chamfer": {"static": {"value": 1.5, "floor": 0.3}, "movable": {"value": None, "floor": 0.1}, "parts": [None], "failures": 1},
+    "chamfer": {
+        "static": {"value": 1.5, "floor": 0.3},
+        "movable": {"value": None, "floor": 0.1},
+        "parts": [None],
+        "failures": 1,
+    },
     "views": {"start": {"psnr_white": 30.0}, "mean": {"psnr_white": 31.0}},
     "penetration": {"mean": 0.01, "max": 0.02},
 }
@@ -35,7 +40,9 @@ def test_every_loss_is_in_one_chart_of_its_kind():
     charts = layout("articulation", losses)["articulation: losses"]
     tags = [tag for _, group in charts.values() for tag in group]
     assert sorted(tags) == sorted(f"^articulation/loss/{name}$" for name in [*losses, "total"])
-    assert charts["image"][1] == [f"^articulation/loss/{name}$" for name in losses if name in ("render", "alpha", "depth")]
+    assert charts["image"][1] == [
+        f"^articulation/loss/{name}$" for name in losses if name in ("render", "alpha", "depth")
+    ]
     assert charts["physics"][1] == ["^articulation/loss/velocity$", "^articulation/loss/contact$"]
     assert "articulation: joints" not in layout("single_state_0", losses)
 
@@ -75,7 +82,11 @@ def test_parameters_and_scores_are_read_back_from_the_event_file(tmp_path):
     assert len(list(folder.glob("events*"))) == 1
     events = EventAccumulator(str(folder)).Reload()
     values = {tag: events.Scalars(tag)[0].value for tag in events.Tags()["scalars"]}
-    assert values["score/joints/axis_angle_mean"] == 0.25 and values["score/minutes"] == 1.5 and values["score/views/psnr_white"] == 31.0
+    assert (
+        values["score/joints/axis_angle_mean"] == 0.25
+        and values["score/minutes"] == 1.5
+        and values["score/views/psnr_white"] == 31.0
+    )
     assert "score/joints/pos_mean_artgs" not in values and "score/chamfer/movable" not in values
     data = HParamsPluginData.FromString(events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content)
     assert data.session_start_info.hparams["articulation.part.weight"].number_value == 0.1

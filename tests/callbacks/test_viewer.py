@@ -20,7 +20,9 @@ N = 30
 def gaussians():
     g = torch.Generator().manual_seed(0)
     quats = torch.randn(N, 4, generator=g)
-    return GaussianTensors(torch.rand(N, 3, generator=g), quats, torch.full((N, 3), -4.0), torch.zeros(N), torch.zeros(N, 1, 3))
+    return GaussianTensors(
+        torch.rand(N, 3, generator=g), quats, torch.full((N, 3), -4.0), torch.zeros(N), torch.zeros(N, 1, 3)
+    )
 
 
 def labels():
@@ -107,7 +109,9 @@ def test_one_page_follows_all_phases(viser):
     assert np.allclose(stage.server.nodes["/part_0/splats"].centers, SIM.to_input(gaussians().means), atol=1e-6)
     assert list(stage.frames) == [0] and not stage.sliders
     none = torch.zeros(N)
-    fused = CanonicalGaussians(gaussians(), torch.ones(1), labels(), none, none > 0, gaussians().means, gaussians().means)
+    fused = CanonicalGaussians(
+        gaussians(), torch.ones(1), labels(), none, none > 0, gaussians().means, gaussians().means
+    )
     second.on_step(None, phase(fused, 20))
     assert list(stage.frames) == [0, 1, 2] and not stage.sliders
     second.on_step(None, phase(articulation(), 30, screws=None))

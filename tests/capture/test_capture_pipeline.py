@@ -26,7 +26,8 @@ LENS = Lens("PINHOLE", 320, 240, np.array([280.0, 280, 160, 120]))
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """Photographs of a box on a floor before a wall, true masks, and the COLMAP model that goes with them; both states alike."""
+    """Photographs of a box on a floor before a wall, true masks, and the COLMAP model that goes with them; both states
+    alike."""
     folder = tmp_path_factory.mktemp("capture")
     floor = box((-3, -3, -0.05), (3, 3, 0), Texture("checks", (0.6, 0.5, 0.3), (0.3, 0.3, 0.5), 0.5, 1))
     wall = box((-1.1, -3, 0), (-1.0, 3, 2.5), Texture("noise", (0.8, 0.8, 0.7), (0.4, 0.6, 0.4), 0.6, 2))
@@ -43,7 +44,9 @@ def capture(tmp_path_factory):
             shot = render([floor, wall, thing], [0, 0, 1], view, LENS.K, 320, 240, samples=1)
             gain = 1.0 if s == 0 else 0.85
             cv2.imwrite(str(folder / state / f"p{s}{i}.jpg"), (gain * shot.image[..., ::-1]).astype(np.uint8))
-            cv2.imwrite(str(folder / "masks" / state / f"p{s}{i}.png"), np.where(shot.parts == 1, 255, 0).astype(np.uint8))
+            cv2.imwrite(
+                str(folder / "masks" / state / f"p{s}{i}.png"), np.where(shot.parts == 1, 255, 0).astype(np.uint8)
+            )
             key = len(photos) + 1
             photos[key] = Photo(f"{state}/p{s}{i}.jpg", 1, view)
             pixels = model.pixels_of(key, xyz)
@@ -123,7 +126,8 @@ def test_the_package_imports_without_pycolmap():
 
 
 def test_cameras_give_the_frame_and_the_misalignment(tmp_path):
-    """A capture in another frame and unit, its end state hung 4 mm off: the similarity is found and the 4 mm are what is left."""
+    """A capture in another frame and unit, its end state hung 4 mm off: the similarity is found and the 4 mm are what
+    is left."""
     rng = np.random.default_rng(0)
     scene, truth = tmp_path / "scene", tmp_path / "truth"
     scene.mkdir(), truth.mkdir()

@@ -29,7 +29,9 @@ def small_model(per_state=8, points=60, names="{state}/{i}.jpg"):
             key += 1
             angle = 2.4 * i / per_state - 1.2 + 0.05 * s
             photos[key] = Photo(
-                names.format(state=state, i=i), 3, look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.2]), (0, 0, 0.4))
+                names.format(state=state, i=i),
+                3,
+                look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.2]), (0, 0, 0.4)),
             )
             pixels = model.pixels_of(key, xyz)
             inside = (pixels > 0).all(1) & (pixels < [320, 240]).all(1)

@@ -1,4 +1,5 @@
-"""The choice of the static hypothesis, the joint model's points, gains, board and floor, on point clouds with known answers."""
+"""The choice of the static hypothesis, the joint model's points, gains, board and floor, on point clouds with known
+answers."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -50,7 +51,8 @@ def reconstruction(xyz, descriptors, state, seed, T=None, noise=0.3):
 
 
 def two_states(room: int, drawer: int, board=False):
-    """A room (floor and wall) with ``room`` points, a drawer's front with ``drawer``, which comes out by ``DRAWER_MOTION``."""
+    """A room (floor and wall) with ``room`` points, a drawer's front with ``drawer``, which comes out by
+    ``DRAWER_MOTION``."""
     rng = np.random.default_rng(3)
     floor = np.c_[
         rng.uniform(-1.2, 1.6, (room // 2, 1)), rng.uniform(-1.5, 1.5, (room // 2, 1)), np.zeros((room // 2, 1))

@@ -159,10 +159,22 @@ FAULTS = {
         "0002.png: image is missing, but camera_train.json",
     ),
     "DTA K missing": ("dta", gone("cam_K.txt"), "cam_K.txt: camera file is missing"),
-    "DTA K short": ("dta", lambda r: (r / "cam_K.txt").write_text("1 0 2"), "cam_K.txt: should hold the 9 numbers of K"),
+    "DTA K short": (
+        "dta",
+        lambda r: (r / "cam_K.txt").write_text("1 0 2"),
+        "cam_K.txt: should hold the 9 numbers of K",
+    ),
     "DTA keyframes missing": ("dta", gone("init_keyframes.yml"), "init_keyframes.yml: camera file is missing"),
-    "DTA keyframes no YAML": ("dta", lambda r: (r / "init_keyframes.yml").write_text("a: [1"), "init_keyframes.yml: is not valid YAML"),
-    "DTA third state": ("dta", lambda r: (r / "init_keyframes.yml").write_text("frame_2_0:\n  cam_in_ob: [1]\n"), "belongs to the time 2"),
+    "DTA keyframes no YAML": (
+        "dta",
+        lambda r: (r / "init_keyframes.yml").write_text("a: [1"),
+        "init_keyframes.yml: is not valid YAML",
+    ),
+    "DTA third state": (
+        "dta",
+        lambda r: (r / "init_keyframes.yml").write_text("frame_2_0:\n  cam_in_ob: [1]\n"),
+        "belongs to the time 2",
+    ),
     "DTA mask missing": ("dta", gone("mask/1_0002.png"), "mask/1_0002.png: image is missing"),
     "DTA mask of another size": (
         "dta",
@@ -232,8 +244,16 @@ NOTES = {
         start(lambda m: m["frames"][0].update(time=1.0)),
         "has time 1.0, but it is read",
     ),
-    "no ground truth": ("artgs", lambda r: shutil.rmtree(r / "gt"), "has no ground truth, so the result cannot be scored"),
-    "broken ground truth": ("artgs", lambda r: (r / "gt/trans.json").write_text("{}"), "so the result cannot be scored"),
+    "no ground truth": (
+        "artgs",
+        lambda r: shutil.rmtree(r / "gt"),
+        "has no ground truth, so the result cannot be scored",
+    ),
+    "broken ground truth": (
+        "artgs",
+        lambda r: (r / "gt/trans.json").write_text("{}"),
+        "so the result cannot be scored",
+    ),
     "ground truth without meshes": ("artgs", gone("gt/end/end_rotate.ply"), "shape cannot be scored"),
 }
 
@@ -254,7 +274,8 @@ def test_sound_scene_has_one_summary_and_nothing_else(written, format, depth):
     (finding,) = check_dataset(written[format])
     assert finding.level == "note"
     assert (
-        f"{format} layout, 8 train (start), 2 test (start), 8 train (end), 2 test (end) views of 40x40 pixels, {depth}" in finding.message
+        f"{format} layout, 8 train (start), 2 test (start), 8 train (end), 2 test (end) views of 40x40 pixels, {depth}"
+        in finding.message
     )
 
 
@@ -264,7 +285,12 @@ def test_several_faults_are_all_listed(copy_of):
         edit_image(root / f"start/train/rgba/000{i}.png", no_alpha)
     (root / "end/train/rgba/0000.png").unlink()
     errors = [f.message for f in check_dataset(root) if f.level == "error"]
-    assert len(errors) == 3 and "end/train/rgba/0000.png" in errors[0] and "0001.png" in errors[1] and "0003.png" in errors[2]
+    assert (
+        len(errors) == 3
+        and "end/train/rgba/0000.png" in errors[0]
+        and "0001.png" in errors[1]
+        and "0003.png" in errors[2]
+    )
 
 
 def test_folder_of_no_layout(tmp_path):

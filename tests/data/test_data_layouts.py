@@ -59,7 +59,9 @@ def test_max_views_spreads_over_the_cameras(written):
     assert [len(scene.select(s, "train")) for s in (0, 1)] == [3, 3] and len(scene.select(split="test")) == 4
     everything = read("artgs", written["artgs"])
     for state in (0, 1):
-        nearest = lambda views: torch.cdist(*[torch.stack([v.camera.position for v in views])] * 2).fill_diagonal_(9).min()  # noqa: E731
+        nearest = lambda views: (
+            torch.cdist(*[torch.stack([v.camera.position for v in views])] * 2).fill_diagonal_(9).min()
+        )  # noqa: E731
         assert nearest(scene.select(state, "train")) > 1.2 * nearest(everything.select(state, "train"))
 
 
@@ -101,7 +103,8 @@ def test_dta_masks_depth_and_states(copy_of):
     depth[mask.shape[0] // 2, :] = 99  # nearer than 0.1 m
     cv2.imwrite(str(root / "depth_filtered/1_0001.png"), np.kron(depth, np.ones((2, 2), np.uint16)))
     lines = (root / "init_keyframes.yml").read_text().splitlines()
-    (root / "init_keyframes.yml").write_text("\n".join(x for x in lines if "time" not in x))  # the prefix tells the state
+    # the prefix tells the state
+    (root / "init_keyframes.yml").write_text("\n".join(x for x in lines if "time" not in x))
     scene = read("dta", root)
     views = {v.name: v for v in scene.views}
     assert np.array_equal(views["0_0000"].alpha.numpy(), mask)
@@ -128,7 +131,9 @@ def test_artgs_paths_and_intrinsics(copy_of):
     after = read("artgs", root)
     for i in range(8):
         assert torch.equal(after.views[i].image, before.views[i].image)
-        assert (after.views[i].depth is not None) and torch.equal(after.views[i].camera.viewmat, before.views[i].camera.viewmat)
+        assert (after.views[i].depth is not None) and torch.equal(
+            after.views[i].camera.viewmat, before.views[i].camera.viewmat
+        )
         if i != 3:
             torch.testing.assert_close(after.views[i].camera.K, before.views[i].camera.K)
     assert after.views[3].camera.K.tolist() == [[60, 0, 19], [0, 61, 22], [0, 0, 1]]

@@ -44,7 +44,10 @@ def cast(view, mesh, rows, cols):
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
     K, M = view.camera.K.double().numpy(), view.camera.viewmat.double().numpy()
-    directions = np.stack([(cols + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(rows))], 1) @ M[:3, :3]
+    directions = (
+        np.stack([(cols + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(rows))], 1)
+        @ M[:3, :3]
+    )
     origins = np.tile(-M[:3, :3].T @ M[:3, 3], (len(rows), 1))
     where, which, _ = RayMeshIntersector(mesh).intersects_location(origins, directions, multiple_hits=False)
     z = np.full(len(rows), np.nan)

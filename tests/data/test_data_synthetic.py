@@ -29,7 +29,8 @@ def pixel_rays(viewmat, K, width, height):
 
 
 def slow_depth(primitives, viewmat, K, size):
-    """[H, W] depth and primitive index: one ray and one primitive at a time, float64; marching to where the ray is inside."""
+    """[H, W] depth and primitive index: one ray and one primitive at a time, float64; marching to where the ray is
+    inside."""
     origin, directions = pixel_rays(viewmat, K, size, size)
     depth, index = np.full((size, size), np.inf), np.full((size, size), -1)
     for i in range(size):
@@ -116,7 +117,9 @@ def test_parts_and_masks_agree_with_the_meshes():
 
     origin, directions = pixel_rays(VIEW, K, size, size)
     flat = directions.reshape(-1, 3)
-    where, ray, face = RayMeshIntersector(whole).intersects_location(np.tile(origin, (len(flat), 1)), flat, multiple_hits=False)
+    where, ray, face = RayMeshIntersector(whole).intersects_location(
+        np.tile(origin, (len(flat), 1)), flat, multiple_hits=False
+    )
     depth, part = np.zeros(size * size), np.full(size * size, -1)
     depth[ray] = where @ VIEW[2, :3] + VIEW[2, 3]
     part[ray] = np.searchsorted(np.cumsum([len(m.faces) for m in meshes]), face, side="right")
@@ -130,7 +133,8 @@ def test_parts_and_masks_agree_with_the_meshes():
 
 def test_light_is_blocked_and_textures_are_bounded():
     floor, roof = box((-1, -1, -0.1), (1, 1, 0), PLAIN), box((-0.4, -0.4, 0.5), (0.4, 0.4, 0.55), PLAIN)
-    points = np.array([[-0.35, 0.25, 0.0], [0.9, 0.9, 0.0], [-0.9, -0.9, 0.0]], np.float32)  # the light comes from +x, -y
+    # the light comes from +x, -y
+    points = np.array([[-0.35, 0.25, 0.0], [0.9, 0.9, 0.0], [-0.9, -0.9, 0.0]], np.float32)
     assert Shadow([floor, roof]).lit(points).tolist() == [0, 1, 1]
     assert Shadow([floor]).lit(points).tolist() == [1, 1, 1]
     p = np.random.default_rng(0).uniform(-1, 1, (4000, 3)).astype(np.float32)
@@ -165,7 +169,8 @@ def test_kinds_cover_both_joint_types_signs_and_part_open_starts():
 
 
 def test_opening_shows_what_was_hidden():
-    """The demo's interior: much of what the end state shows behind the door is part of the base and was covered before."""
+    """The demo's interior: much of what the end state shows behind the door is part of the base and was covered
+    before."""
     obj = cabinet()
     assert [j.type for j in obj.joints] == ["revolute", "prismatic"]
     viewmat, K = look_at(np.array([2.8, -0.9, 1.2])), intrinsics(100)
@@ -198,7 +203,9 @@ def test_same_seed_same_pixels(toy):
     assert not np.allclose(train_cameras(4, 9)[0], train_cameras(4, 8)[0])
     first, again, other = make_object("cabinet", 2), make_object("cabinet", 2), make_object("cabinet", 3)
     assert np.array_equal(first.mesh(0, 0)[0], again.mesh(0, 0)[0])
-    assert first.mesh(0, 0)[0].shape != other.mesh(0, 0)[0].shape or not np.allclose(first.mesh(0, 0)[0], other.mesh(0, 0)[0])
+    assert first.mesh(0, 0)[0].shape != other.mesh(0, 0)[0].shape or not np.allclose(
+        first.mesh(0, 0)[0], other.mesh(0, 0)[0]
+    )
 
 
 def test_data_module_writes_once_and_memory_is_the_same(tmp_path):
@@ -211,7 +218,11 @@ def test_data_module_writes_once_and_memory_is_the_same(tmp_path):
     memory = SyntheticData(root=None, **options).scene()
     assert len(disk.views) == len(again.views) == len(memory.views) == 12
     for a, b in zip(disk.views, memory.views, strict=True):
-        assert torch.equal(a.image, b.image) and torch.equal(a.alpha, b.alpha) and (a.state, a.split, a.name) == (b.state, b.split, b.name)
+        assert (
+            torch.equal(a.image, b.image)
+            and torch.equal(a.alpha, b.alpha)
+            and (a.state, a.split, a.name) == (b.state, b.split, b.name)
+        )
         torch.testing.assert_close(a.camera.viewmat, b.camera.viewmat, atol=1e-5, rtol=0)
         torch.testing.assert_close(a.depth, b.depth, atol=1e-3, rtol=0)
     assert load_ground_truth(root, "synthetic") is not None

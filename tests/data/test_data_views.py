@@ -59,7 +59,12 @@ class Nothing(TwoStateData):
 
 
 def quiet_trainer(steps, folder):
-    options = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
+    options = {
+        "logger": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "enable_checkpointing": False,
+    }
     return Trainer(max_steps=steps, max_epochs=-1, accelerator="cpu", default_root_dir=folder, **options)
 
 
@@ -84,8 +89,12 @@ def test_a_loader_covers_the_views_of_its_states():
     loader = Nothing().visits(both, 3)
     seen = [loader[step] for step in range(16)]
     assert sorted(visit[1:] for visit in seen) == [(state, view) for state in (0, 1) for view in range(8)]
-    assert list(zip(range(3), Nothing().visits(both, 3, first=5), strict=False)) == [(i, loader[5 + i]) for i in range(3)]
-    assert [v.view for v, _ in zip(Nothing().visits({1: range(8)}, 3), range(8), strict=False)] == [v.view for v in seen if v.state == 1]
+    assert list(zip(range(3), Nothing().visits(both, 3, first=5), strict=False)) == [
+        (i, loader[5 + i]) for i in range(3)
+    ]
+    assert [v.view for v, _ in zip(Nothing().visits({1: range(8)}, 3), range(8), strict=False)] == [
+        v.view for v in seen if v.state == 1
+    ]
     assert Nothing().visits({}, 3)[9] == Visit(9)  # of a phase that looks at none
 
 
@@ -94,13 +103,24 @@ def random_view(rng, height, width, depth=True):
     y, x = height // 4, width // 5
     alpha[y : 3 * y, x : 3 * x] = rng.integers(1, 256, (2 * y, 2 * x))
     z = np.where(alpha > 127, rng.uniform(2, 4, alpha.shape), 0).astype(np.float32)
-    camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, width / 2 + 1], [0, 52.0, height / 2 - 2], [0, 0, 1]]), width, height)
+    camera = Camera(
+        torch.eye(4), torch.tensor([[50.0, 0, width / 2 + 1], [0, 52.0, height / 2 - 2], [0, 0, 1]]), width, height
+    )
     image = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
-    return View("v", 0, "train", camera, torch.from_numpy(image), torch.from_numpy(alpha), torch.from_numpy(z) if depth else None)
+    return View(
+        "v",
+        0,
+        "train",
+        camera,
+        torch.from_numpy(image),
+        torch.from_numpy(alpha),
+        torch.from_numpy(z) if depth else None,
+    )
 
 
 def area_slow(view, height, width):
-    """Premultiplied colour and alpha (0..1) averaged over each new pixel's area, overlaps weighted, one pixel at a time."""
+    """Premultiplied colour and alpha (0..1) averaged over each new pixel's area, overlaps weighted, one pixel at a
+    time."""
     a = view.alpha.numpy().astype(float) / 255
     stack = np.dstack([view.image.numpy() / 255 * a[..., None], a])
     out = np.zeros((height, width, 4))
@@ -152,7 +172,12 @@ def test_crop_holds_the_mask_and_its_camera_sees_the_same():
     background = torch.tensor([1.0, 0.0, 0.5])
     for level, scale in ((0, 1.0), (1, 0.5)):
         target = views.get(0, level, background)
-        assert target.image.shape[:2] == target.alpha.shape == target.depth.shape == (target.camera.height, target.camera.width)
+        assert (
+            target.image.shape[:2]
+            == target.alpha.shape
+            == target.depth.shape
+            == (target.camera.height, target.camera.width)
+        )
         assert target.camera.width % 16 == 0 and target.camera.height % 16 == 0
         assert target.camera.width < 160 * scale and views.camera(0, level) is target.camera
         x, y = (int(round(float(view.camera.K[i, 2] * scale - target.camera.K[i, 2]))) for i in (0, 1))
@@ -191,7 +216,9 @@ def test_get_is_deterministic_and_keys_tell_crops_apart():
     assert torch.equal(views.get(0, 1, background).image, b.image), "a caller may write into what it got"
     keys = {views.get(i, level, background).key for i in (0, 1) for level in (0, 1)}
     assert len(keys) == 4
-    assert torch.equal(views.get(0, 2, background).image, b.image), "a level above the photograph's size holds it at its own size"
+    assert torch.equal(views.get(0, 2, background).image, b.image), (
+        "a level above the photograph's size holds it at its own size"
+    )
 
 
 @given(n=st.integers(0, 40), count=st.integers(1, 50))
@@ -212,4 +239,8 @@ def test_mask_bounds_and_farthest_cameras():
     alpha[3:5, 7:9] = 1
     assert mask_bounds(alpha) == (7, 3, 9, 5)
     line = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.5, 0, 0], [1.0, 0, 0]])
-    assert farthest_cameras(line, 2) == [0, 3] and farthest_cameras(line, 3) == [0, 2, 3] and farthest_cameras(line, 9) == [0, 1, 2, 3]
+    assert (
+        farthest_cameras(line, 2) == [0, 3]
+        and farthest_cameras(line, 3) == [0, 2, 3]
+        and farthest_cameras(line, 9) == [0, 1, 2, 3]
+    )

@@ -44,7 +44,11 @@ def test_an_image_elsewhere_is_named_or_refused(copy_of, tmp_path, how, capsys):
 
     findings = check_dataset(root)
     named = [f.message for f in findings if "leads out of the scene's folder" in f.message]
-    assert len(named) == 1 and str((away / "there.png").resolve()) in named[0] and not any(f.level == "error" for f in findings)
+    assert (
+        len(named) == 1
+        and str((away / "there.png").resolve()) in named[0]
+        and not any(f.level == "error" for f in findings)
+    )
     assert DATASETS["artgs"](root=str(root)).scene().views
     assert named[0] in capsys.readouterr().err
 
@@ -63,7 +67,9 @@ def test_a_name_of_a_frame_may_lead_out(copy_of, tmp_path):
     cameras = json.loads(file.read_text())
     cameras["../../../../there"] = cameras.pop("0000")
     file.write_text(json.dumps(cameras))
-    assert any("there.png: leads out" in f.message and f.level == "error" for f in check_dataset(root, strict_paths=True))
+    assert any(
+        "there.png: leads out" in f.message and f.level == "error" for f in check_dataset(root, strict_paths=True)
+    )
 
 
 @pytest.mark.parametrize("name", ["cam_K.txt", "init_keyframes.yml", "mask/1_0002.png", "depth_filtered/0_0005.png"])
@@ -102,5 +108,19 @@ def test_the_commands_take_the_option(copy_of, tmp_path, capsys):
     assert run(["data", "check", str(root)]) == 0
     assert run(["data", "check", str(root), "--strict_paths"]) == 2
     capsys.readouterr()
-    assert run(["fit", "-c", "preset/smoke.yaml", "--data.root", str(root), "--run", str(tmp_path / "run"), "--strict_paths"]) == 2
+    assert (
+        run(
+            [
+                "fit",
+                "-c",
+                "preset/smoke.yaml",
+                "--data.root",
+                str(root),
+                "--run",
+                str(tmp_path / "run"),
+                "--strict_paths",
+            ]
+        )
+        == 2
+    )
     assert "refused, as strict_paths asks" in capsys.readouterr().err

@@ -36,14 +36,20 @@ def drawer(y0, y1, z0, z1, travel, depth=0.6):
         box((-depth, y1 - 0.07, z0 + 0.07), (0, y1 - 0.05, z1 - 0.1), PLAIN),
         box((-depth, y0 + 0.07, z0 + 0.07), (0.02 - depth, y1 - 0.07, z1 - 0.1), PLAIN),
     ]
-    return SyntheticPart("drawer", (box((0, y0, z0), (0.04, y1, z1), PLAIN), *tray), prismatic((1, 0, 0), (0, 0, 0), 0, travel))
+    return SyntheticPart(
+        "drawer", (box((0, y0, z0), (0.04, y1, z1), PLAIN), *tray), prismatic((1, 0, 0), (0, 0, 0), 0, travel)
+    )
 
 
 def door(y0, y1, z0, z1, left, angle):
-    """A panel hinged at low y (``left``) or high y, opening outwards by ``angle`` degrees, with a knob at its free edge."""
+    """A panel hinged at low y (``left``) or high y, opening outwards by ``angle`` degrees, with a knob at its free
+    edge."""
     hinge, knob = (y0, y1 - 0.08) if left else (y1, y0 + 0.08)
     middle = (z0 + z1) / 2
-    parts = (box((0, y0, z0), (0.04, y1, z1), PLAIN), box((0.04, knob - 0.02, middle - 0.08), (0.09, knob + 0.02, middle + 0.08), PLAIN))
+    parts = (
+        box((0, y0, z0), (0.04, y1, z1), PLAIN),
+        box((0.04, knob - 0.02, middle - 0.08), (0.09, knob + 0.02, middle + 0.08), PLAIN),
+    )
     return SyntheticPart("door", parts, revolute((0, 0, -1.0 if left else 1.0), (0.04, hinge, middle), 0, angle))
 
 
@@ -52,7 +58,15 @@ def shell(*moving, static=()):
     return SyntheticObject("boxes", (SyntheticPart("base", tuple(base)), *moving)).fitted()
 
 
-def evidence(obj: SyntheticObject, state: int, seed: int = 0, size: int = 110, views: int = 28, noise: float = 0.003, points: int = 4000):
+def evidence(
+    obj: SyntheticObject,
+    state: int,
+    seed: int = 0,
+    size: int = 110,
+    views: int = 28,
+    noise: float = 0.003,
+    points: int = 4000,
+):
     """What a reconstruction of this state might give, and the true part of each of its points."""
     rng = np.random.default_rng([seed, state])
     primitives, ids = obj.posed(float(state))
@@ -73,9 +87,9 @@ def evidence(obj: SyntheticObject, state: int, seed: int = 0, size: int = 110, v
     cloud, parts = np.concatenate(cloud), np.concatenate(parts)
     pick = rng.choice(len(cloud), points, replace=False)
     cloud = torch.from_numpy(cloud[pick]).float()
-    return StateEvidence(cloud, torch.full((points, 3), 0.5), None, torch.ones(points), depths, alphas, cameras), torch.from_numpy(
-        parts[pick]
-    )
+    return StateEvidence(
+        cloud, torch.full((points, 3), 0.5), None, torch.ones(points), depths, alphas, cameras
+    ), torch.from_numpy(parts[pick])
 
 
 def both(obj: SyntheticObject, seed: int = 0, **kw):

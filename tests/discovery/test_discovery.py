@@ -36,9 +36,12 @@ def match(found, obj):
         right = [
             k
             for k, m in enumerate(found.motions)
-            if m.type == part.joint.type and np.abs(m.transform.numpy() - G).max() < (0.15 if m.type == "revolute" else 0.05)
+            if m.type == part.joint.type
+            and np.abs(m.transform.numpy() - G).max() < (0.15 if m.type == "revolute" else 0.05)
         ]
-        assert right, f"{part.joint.type} {part.joint.motion:.2f} is missing among {[(m.type, round(m.amount, 2)) for m in found.motions]}"
+        assert right, (
+            f"{part.joint.type} {part.joint.motion:.2f} is missing among {[(m.type, round(m.amount, 2)) for m in found.motions]}"
+        )
         axis, position, amount = joint_errors(found.motions[right[0]], part.joint, G)
         assert axis < 2 and position < 0.03, (axis, position)
         assert amount < (3 if part.joint.type == "revolute" else 0.03)
@@ -50,13 +53,18 @@ def label_accuracy(found, order, truth):
     part_of = torch.zeros(len(found.motions) + 1, dtype=torch.long)
     for part, k in enumerate(order):
         part_of[k + 1] = part + 1
-    return [float((part_of[lab] == t).float().mean()) for lab, t in zip((found.labels_start, found.labels_end), truth, strict=True)]
+    return [
+        float((part_of[lab] == t).float().mean())
+        for lab, t in zip((found.labels_start, found.labels_end), truth, strict=True)
+    ]
 
 
 @pytest.fixture(scope="module")
 def door_and_drawer():
     obj = shell(
-        door(-0.6, 0.6, 0.0, 0.6, True, 60), drawer(-0.6, 0.6, -0.6, 0.0, 0.35), static=[box((-0.7, -0.6, -0.02), (0, 0.6, 0.02), PLAIN)]
+        door(-0.6, 0.6, 0.0, 0.6, True, 60),
+        drawer(-0.6, 0.6, -0.6, 0.0, 0.35),
+        static=[box((-0.7, -0.6, -0.02), (0, 0.6, 0.02), PLAIN)],
     )
     views, truth = both(obj)
     return obj, views, truth, discover(*views, "auto", SMALL, seed=0)
@@ -77,7 +85,8 @@ def test_a_wrong_motion_amid_right_ones_is_asked_for_anew(door_and_drawer):
     T[drawer_k], types[drawer_k] = T[door_k] @ T[door_k], "revolute"
     proposed = instead_of(found, T, types, drawer_k)
     assert {kind for _, kind in proposed} == {"revolute", "prismatic"} and len(proposed) <= 4
-    assert min(float((A[:3, 3] - truth[:3, 3]).norm()) for A, kind in proposed if kind == "prismatic") < 0.1  # before it is refined
+    # before it is refined
+    assert min(float((A[:3, 3] - truth[:3, 3]).norm()) for A, kind in proposed if kind == "prismatic") < 0.1
     # so it is when the part is missing
     more = instead_of(found, T[[door_k]], ["revolute"], None)
     assert min(float((A[:3, 3] - truth[:3, 3]).norm()) for A, kind in more if kind == "prismatic") < 0.1
@@ -87,21 +96,29 @@ def test_a_wrong_motion_amid_right_ones_is_asked_for_anew(door_and_drawer):
 
 
 def test_two_like_parts_taken_for_one_another_change_back():
-    """Two cubes, each said to have gone where the other is: no surfel is left over, and no change of one motion alone mends it."""
+    """Two cubes, each said to have gone where the other is: no surfel is left over, and no change of one motion alone
+    mends it."""
 
     def cube(x, y, travel):
-        return SyntheticPart("cube", (box((x, y, 0), (x + 0.3, y + 0.3, 0.3), PLAIN),), prismatic((1, 0, 0), (0, 0, 0), 0, travel))
+        return SyntheticPart(
+            "cube", (box((x, y, 0), (x + 0.3, y + 0.3, 0.3), PLAIN),), prismatic((1, 0, 0), (0, 0, 0), 0, travel)
+        )
 
     floor = SyntheticPart("base", (box((-0.7, -0.6, -0.1), (0.7, 0.6, 0), PLAIN),))
     obj = SyntheticObject("cubes", (floor, cube(-0.6, -0.5, 0.5), cube(-0.5, 0.2, 0.7))).fitted()
     found = discover(*both(obj)[0], "auto", SMALL, seed=0)
     truth = torch.stack([torch.as_tensor(p.pose(1.0) @ np.linalg.inv(p.pose(0.0))) for p in obj.parts[1:]])
-    between = torch.tensor([0.1, 0.7, 0.0]).double() * float(truth[0, :3, 3].norm() / 0.5)  # from the first cube to the second, fitted
+    # from the first cube to the second, fitted
+    between = torch.tensor([0.1, 0.7, 0.0]).double() * float(truth[0, :3, 3].norm() / 0.5)
     wrong = truth.clone()
     wrong[0, :3, 3] = between + truth[1, :3, 3]
     wrong[1, :3, 3] = truth[0, :3, 3] - between
     proposed = places_changed(found, wrong, ["prismatic"] * 2)
-    off = [max(float((T[k] - truth[k])[:3, 3].norm()) for k in (0, 1)) for _, T, types in proposed if types == ["prismatic"] * 2]
+    off = [
+        max(float((T[k] - truth[k])[:3, 3].norm()) for k in (0, 1))
+        for _, T, types in proposed
+        if types == ["prismatic"] * 2
+    ]
     assert min(off) < 0.05
 
 
@@ -133,7 +150,9 @@ def test_every_candidate_is_complete(door_and_drawer):
     for c in found.candidates:
         assert int(c.labels_start.max()) <= len(c.motions) and len(c.labels_end) == len(views[1].points)
     assert {"tau", "noise", "states", "axes", "search", "seconds", "candidates"} <= set(found.diagnostics)
-    assert len(found.diagnostics["search"]) == SMALL.searches and all(s["motions_tried"] > 0 for s in found.diagnostics["search"])
+    assert len(found.diagnostics["search"]) == SMALL.searches and all(
+        s["motions_tried"] > 0 for s in found.diagnostics["search"]
+    )
 
 
 def test_double_doors_are_not_swapped():
@@ -164,7 +183,8 @@ def test_nothing_moves():
 
 
 def test_revealed_inside_is_not_a_part(door_and_drawer):
-    """What the opened door shows of the cupboard's inside stays static, and is unknown rather than moved to the evidence."""
+    """What the opened door shows of the cupboard's inside stays static, and is unknown rather than moved to the
+    evidence."""
     _, views, truth, found = door_and_drawer
     inside = (truth[1] == 0) & (views[1].points[:, 0] < -0.3) & (found.evidence_end != 0)
     assert int(inside.sum()) > 20

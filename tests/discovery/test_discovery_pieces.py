@@ -56,7 +56,8 @@ def test_free_on_behind_counts_match_the_slow_twin():
 
 
 def test_views_of_different_size_are_counted_alike():
-    """A view cropped to its upper left says of points inside the crop what the whole view says, and nothing of the others."""
+    """A view cropped to its upper left says of points inside the crop what the whole view says, and nothing of the
+    others."""
     (start, end), _ = both(shell(door(-0.6, 0.6, -0.6, 0.6, True, 50)), views=4, size=60, points=600)
     keep = [(40, 60), (60, 45), (60, 60), (50, 50)]
     cameras = [c.cropped(0, 0, w, h) for c, (h, w) in zip(end.cameras, keep, strict=True)]
@@ -84,7 +85,8 @@ def test_seen_through_is_moved_and_covered_is_unknown():
     (start, end), (part, _) = both(obj)
     problem, _ = build_problem(start, end, DiscoveryConfig(surfels=4000), 0)
     end_points, start_points = problem.surfels[1].points, problem.surfels[0].points
-    inside = (end_points[:, 0] < -0.2) & (end_points[:, 1:].abs().max(1).values < 0.3)  # of the cupboard, shut away at the start
+    # of the cupboard, shut away at the start
+    inside = (end_points[:, 0] < -0.2) & (end_points[:, 1:].abs().max(1).values < 0.3)
     assert int(inside.sum()) > 30
     assert not bool((problem.moved[1] & inside).any())
     front = start_points[:, 0] > float(start.points[part == 1][:, 0].quantile(0.3))
@@ -103,7 +105,8 @@ def test_ranking_is_by_score_without_the_same_motions_again():
 
 @pytest.fixture(scope="module")
 def stacked():
-    """Two stacked doors on one hinge, 36 and 30 degrees open: what they are as one motion whose hinge tilts, and the truth."""
+    """Two stacked doors on one hinge, 36 and 30 degrees open: what they are as one motion whose hinge tilts, and the
+    truth."""
     obj = shell(door(-0.6, 0.6, -0.62, -0.02, True, 36), door(-0.6, 0.6, 0.02, 0.62, True, 30))
     (start, end), _ = both(obj)
     problem, _ = build_problem(start, end, DiscoveryConfig(surfels=4000), 0)
@@ -146,7 +149,10 @@ def test_where_a_part_lands_on_another_it_is_as_wrong_as_in_empty_space(stacked)
     swapped = Labelling([right.probability[0][:, [0, 2, 1]], right.probability[1]], right.cost)
     index = (right.labels(1) == 1).nonzero()[:, 0]
     good = violation(problem, truth, right, 1, index)
-    assert float(good.mean()) < 0.35 and float(violation(problem, truth, swapped, 1, index).mean()) > float(good.mean()) + 0.1
+    assert (
+        float(good.mean()) < 0.35
+        and float(violation(problem, truth, swapped, 1, index).mean()) > float(good.mean()) + 0.1
+    )
     lost = Labelling([torch.eye(3)[torch.zeros(len(p), dtype=torch.long)] for p in right.probability], right.cost)
     moved = problem.moved[1].nonzero()[:, 0]
     assert bool((violation(problem, truth, lost, 1, moved) == 1).all())  # what moved is called static
@@ -231,7 +237,10 @@ def test_what_has_another_colour_in_its_place_has_changed_and_may_have_been_behi
     wall = problem.surfels[0]
     red = wall.points[:, 2] > wall.points[:, 2].median()
     colours = torch.where(red[:, None], torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.4, 0.4, 0.4]))
-    walls = [Surfels(wall.points, wall.normals, c, wall.spacing, wall.noise) for c in (colours, torch.full_like(colours, 0.4))]
+    walls = [
+        Surfels(wall.points, wall.normals, c, wall.spacing, wall.noise)
+        for c in (colours, torch.full_like(colours, 0.4))
+    ]
     moved, static, replaced = evidence_masks(walls, [stack, stack], problem.scale.tau, 0.2)
     for s in (0, 1):
         assert torch.equal(moved[s], replaced[s]) and not (moved[s] & static[s]).any()

@@ -1,4 +1,5 @@
-"""A folder in which the docs' blocks can be run without leaving traces in the registries, and photographs to run them on."""
+"""A folder in which the docs' blocks can be run without leaving traces in the registries, and photographs to run them
+on."""
 
 from __future__ import annotations
 
@@ -46,7 +47,8 @@ def photographs():
 
 @pytest.fixture
 def capture(photographs):
-    """``capture(folder, **lens)``: what a user has: nerfstudio's transforms.json, RGB images on a grey wall, and masks, in both states."""
+    """``capture(folder, **lens)``: what a user has: nerfstudio's transforms.json, RGB images on a grey wall, and masks,
+    in both states."""
     import cv2
     import numpy as np
 

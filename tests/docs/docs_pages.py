@@ -24,9 +24,12 @@ def blocks(page: Path) -> list[Block]:
 
 
 def command_lines(text: str) -> list[list[str]]:
-    """The words of each line that runs p2gs (``lightning fit`` is one too); comments and line continuations are undone."""
+    """The words of each line that runs p2gs (``lightning fit`` is one too); comments and line continuations are
+    undone."""
     lines = text.replace("\\\n", " ").splitlines()
-    return [words[1:] for line in lines if (words := shlex.split(line, comments=True)) and words[0] in ("p2gs", "lightning")]
+    return [
+        words[1:] for line in lines if (words := shlex.split(line, comments=True)) and words[0] in ("p2gs", "lightning")
+    ]
 
 
 def page_commands(page: Path) -> list[list[str]]:
@@ -43,4 +46,6 @@ def write_files(page: Path, folder: Path) -> list[str]:
     for b in blocks(page):
         if b.title:
             (folder / b.title).write_text(b.text)
-    return [b.title.removesuffix(".py") for b in blocks(page) if b.kind == "python" and b.title and "register" in b.text]
+    return [
+        b.title.removesuffix(".py") for b in blocks(page) if b.kind == "python" and b.title and "register" in b.text
+    ]

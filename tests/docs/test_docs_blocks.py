@@ -1,4 +1,5 @@
-"""The docs say what the program does: their commands parse against real configs, their YAML is read, their Python runs."""
+"""The docs say what the program does: their commands parse against real configs, their YAML is read, their Python
+runs."""
 
 from __future__ import annotations
 
@@ -51,7 +52,9 @@ def test_commands_are_understood(page, desk):
 
 def within(given, whole) -> bool:
     """Whether a mapping holds what another one names, at every level."""
-    return all(k in whole and within(v, whole[k]) for k, v in given.items()) if isinstance(given, dict) else given == whole
+    return (
+        all(k in whole and within(v, whole[k]) for k, v in given.items()) if isinstance(given, dict) else given == whole
+    )
 
 
 @written([p for p in PAGES if p.stem not in OWN_TESTS])
@@ -107,8 +110,15 @@ def test_the_callback_writes_its_file_in_a_training_phase(desk):
     config = SingleStateConfig(steps=5, initial_gaussians=50, levels=[24], level_starts=[0.0])
     views = TrainingViews(scene.select(state=0), [24])
     phase = SingleStatePhase(config, {"render": LOSSES["render"]()}, scene, 0, views)
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
-    trainer = Trainer(max_steps=5, max_epochs=-1, accelerator="cpu", callbacks=[callback], default_root_dir=desk, **quiet)
+    quiet = {
+        "logger": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "enable_checkpointing": False,
+    }
+    trainer = Trainer(
+        max_steps=5, max_epochs=-1, accelerator="cpu", callbacks=[callback], default_root_dir=desk, **quiet
+    )
     trainer.fit(phase, datamodule=TinyData())
     lines = [json.loads(line) for line in (desk / "joints.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [2, 4, 5] and lines[0]["gaussians"] == 50
@@ -128,13 +138,17 @@ def test_a_capture_becomes_a_scene(bend, desk, capture, photographs, monkeypatch
     scene = load_config(["preset/cpu.yaml", "data/artgs.yaml"], ["--data.root", "my_scene"]).data.raw_scene()
     assert len(scene.views) == 16 and len(scene.select(split="test")) == 2
     first, true = scene.select(0, "test")[0], photographs.select(0)[0]
-    assert torch.allclose(first.camera.viewmat, true.camera.viewmat, atol=1e-5) and torch.allclose(first.camera.K, true.camera.K)
+    assert torch.allclose(first.camera.viewmat, true.camera.viewmat, atol=1e-5) and torch.allclose(
+        first.camera.K, true.camera.K
+    )
     off = (first.alpha.float() - true.alpha.float()).abs().mean()
     assert off == 0 if bend == 0 else 0 < off < 10
 
 
 def test_the_generated_scene_of_the_data_page(desk, capsys):
-    words = [w for w in page_commands(REPOSITORY / "docs" / "data.md") if w[:2] in (["data", "synth"], ["data", "check"])][:2]
+    words = [
+        w for w in page_commands(REPOSITORY / "docs" / "data.md") if w[:2] in (["data", "synth"], ["data", "check"])
+    ][:2]
     assert [main(w) for w in words] == [0, 0]
     assert "example: can be trained on" in capsys.readouterr().out
 
@@ -150,7 +164,8 @@ def test_links_lead_somewhere():
             assert file.exists(), f"{page.name}: {link}"
             if anchor:
                 heads = [
-                    re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-") for h in re.findall(r"^#+ (.*)$", file.read_text(), re.M)
+                    re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-")
+                    for h in re.findall(r"^#+ (.*)$", file.read_text(), re.M)
                 ]
                 assert anchor in heads, f"{page.name}: {link}"
 
@@ -163,7 +178,8 @@ def test_every_page_is_in_the_site():
 def test_files_named_in_the_pages_exist():
     for page in [*PAGES, README]:
         for name in re.findall(
-            r"`((?:p2gs/|tests/|models/|losses/|ops/|preset/|data/|ablation/|bench/)[\w/]+\.?(?:py|yaml|md)?/?)`", page.read_text()
+            r"`((?:p2gs/|tests/|models/|losses/|ops/|preset/|data/|ablation/|bench/)[\w/]+\.?(?:py|yaml|md)?/?)`",
+            page.read_text(),
         ):
             places = (REPOSITORY, REPOSITORY / "p2gs", REPOSITORY / "configs")
             assert any((place / name).exists() for place in places), f"{page.name}: {name}"

@@ -21,7 +21,9 @@ def test_every_cell_runs(tmp_path):
             lines.append(f"assert {text} == 0, {text!r}" if text.startswith("main(") else text)
     (tmp_path / "cells.py").write_text("\n".join(lines))
     environment = {**os.environ, "OMP_WAIT_POLICY": "passive", "PYTHONPATH": str(REPO)}
-    done = subprocess.run([sys.executable, "cells.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        [sys.executable, "cells.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "articulation: runs again: phases.articulation.losses.contact" in done.stdout, done.stdout
     assert (tmp_path / "twin" / "twin.json").is_file()

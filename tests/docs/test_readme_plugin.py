@@ -1,4 +1,5 @@
-"""The README's own loss, as a user has it: a file named by --plugins, and a module that an installed package announces."""
+"""The README's own loss, as a user has it: a file named by --plugins, and a module that an installed package
+announces."""
 
 import importlib.metadata
 
@@ -43,7 +44,9 @@ def test_by_entry_point(files, capsys, monkeypatch):
     name, value = (part.strip(' "') for part in line.split("="))
     point = importlib.metadata.EntryPoint(name, value, "p2gs.plugins")
     real = importlib.metadata.entry_points
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **k: [point] if k.get("group") == "p2gs.plugins" else real(**k))
+    monkeypatch.setattr(
+        importlib.metadata, "entry_points", lambda **k: [point] if k.get("group") == "p2gs.plugins" else real(**k)
+    )
     assert printed(capsys)["phases"]["single_state"]["losses"]["round"]["weight"] == 0.02
 
 

@@ -29,7 +29,8 @@ def shape(value):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The demo cabinet's joints on a few Gaussians at the parts' places, boxes as meshes; its scene with depth and ground truth."""
+    """The demo cabinet's joints on a few Gaussians at the parts' places, boxes as meshes; its scene with depth and
+    ground truth."""
     import numpy as np
     import trimesh
 
@@ -85,7 +86,9 @@ def test_files(run):
 
     listed = set(re.findall(r"`([\w./{},]+)`", PAGE.read_text().split("## twin.json")[0]))
     for path in run.iterdir():
-        assert {path.name, path.name + "/"} & {name.split("/")[0] + ("/" if "/" in name else "") for name in listed}, path.name
+        assert {path.name, path.name + "/"} & {name.split("/")[0] + ("/" if "/" in name else "") for name in listed}, (
+            path.name
+        )
     for path in (run / "splats").iterdir():
         assert {path.name, f"splats/{path.name}"} & listed
     assert set(EXPORTERS) == {"urdf", "mjcf", "glb", "usd", "ply", "obj", "splats", "spz"}
@@ -95,4 +98,7 @@ def test_its_python(run, monkeypatch, capsys):
     (block,) = [b for b in blocks(PAGE) if b.kind == "python"]
     names = {}
     exec(block.text.replace('"runs/my_scene"', "run"), {"run": run}, names)
-    assert capsys.readouterr().out.splitlines() == ["0 static", "1 revolute 60", "2 prismatic 0.3"] and len(names["half_open"]) == 90
+    assert (
+        capsys.readouterr().out.splitlines() == ["0 static", "1 revolute 60", "2 prismatic 0.3"]
+        and len(names["half_open"]) == 90
+    )

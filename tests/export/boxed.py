@@ -1,4 +1,5 @@
-"""A result folder of the toy cabinet whose meshes are boxes by trimesh: nothing is rendered or fused, so it takes no time."""
+"""A result folder of the toy cabinet whose meshes are boxes by trimesh: nothing is rendered or fused, so it takes no
+time."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ COLOURS = ((191, 178, 153), (77, 115, 179), (179, 89, 77))
 def boxes(bounds, colour) -> Mesh:
     """One mesh of closed boxes, with vertices at most 0.15 apart."""
     mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=b).subdivide_to_size(0.15) for b in bounds])
-    return Mesh(np.array(mesh.vertices), np.array(mesh.faces), np.tile(np.array(colour, np.uint8), (len(mesh.vertices), 1)))
+    return Mesh(
+        np.array(mesh.vertices), np.array(mesh.faces), np.tile(np.array(colour, np.uint8), (len(mesh.vertices), 1))
+    )
 
 
 def boxed_run(folder: Path) -> Path:

@@ -21,7 +21,15 @@ def link(name, pieces, hinge=None) -> Link:
     """Pieces in world axes at the start."""
     at = np.zeros(3) if hinge is None else hinge.origin
     pieces = [Piece(p.vertices - at, p.faces) for p in pieces]
-    return Link(name, int(name[-1]) if hinge else 0, Mesh.empty(), pieces, Inertia(1.0, np.zeros(3), np.eye(3)), hinge, (0.5, 0.5, 0.5))
+    return Link(
+        name,
+        int(name[-1]) if hinge else 0,
+        Mesh.empty(),
+        pieces,
+        Inertia(1.0, np.zeros(3), np.eye(3)),
+        hinge,
+        (0.5, 0.5, 0.5),
+    )
 
 
 def slide(axis, reach) -> Hinge:
@@ -68,9 +76,15 @@ def test_every_pair_is_free_over_the_whole_range():
 
 
 def test_parts_that_touch_nothing_stay_as_they_are():
-    links = [link("base", [block((0, 0, 0), (1, 1, 0.1))]), link("part_1", [block((0, 0, 0.2), (1, 1, 0.3))], slide((0, 0, 1), 0.5))]
+    links = [
+        link("base", [block((0, 0, 0), (1, 1, 0.1))]),
+        link("part_1", [block((0, 0, 0.2), (1, 1, 0.3))], slide((0, 0, 1), 0.5)),
+    ]
     cleared = clear_links(links)
-    assert all(np.array_equal(a.collision[0].vertices, b.collision[0].vertices) for a, b in zip(links, cleared.links, strict=True))
+    assert all(
+        np.array_equal(a.collision[0].vertices, b.collision[0].vertices)
+        for a, b in zip(links, cleared.links, strict=True)
+    )
     assert set(cleared.lost.values()) == {0.0}
 
 
@@ -97,7 +111,10 @@ def test_a_door_before_a_drawer_is_reported_and_not_cut():
 
 def test_the_gap_is_as_wide_as_said():
     base, part = clear_links(
-        [link("base", [block((0, 0, 0), (1, 1, 0.1))]), link("part_1", [block((0, 0, 0.098), (1, 1, 0.2))], slide((1, 0, 0), 0.5))]
+        [
+            link("base", [block((0, 0, 0), (1, 1, 0.1))]),
+            link("part_1", [block((0, 0, 0.098), (1, 1, 0.2))], slide((1, 0, 0), 0.5)),
+        ]
     ).links
     depth = separation(base.collision[0], part.collision[0])[0]
     assert depth == pytest.approx(-GAP * np.linalg.norm([1, 1, 0.2]), rel=1e-6)
@@ -112,7 +129,9 @@ def test_cut_and_separation_agree_with_manifold():
         n, d = n / np.linalg.norm(n), float(rng.normal() * 0.3)
         solid = trimesh.Trimesh(a.vertices, a.faces)
         part = cut(a, n, d)
-        want = solid.slice_plane(n * d, -n, cap=True, engine="manifold").volume if (a.vertices @ n > d).any() else a.volume
+        want = (
+            solid.slice_plane(n * d, -n, cap=True, engine="manifold").volume if (a.vertices @ n > d).any() else a.volume
+        )
         assert (0.0 if part is None else part.volume) == pytest.approx(want, abs=1e-6)
         both = trimesh.boolean.intersection([solid, trimesh.Trimesh(b.vertices, b.faces)], engine="manifold")
         assert (separation(a, b)[0] > 0) == (both.volume > 1e-9)

@@ -1,4 +1,5 @@
-"""What lies on or in an open drawer's tray is the drawer's, whatever else it was taken for; what only seems to is left alone."""
+"""What lies on or in an open drawer's tray is the drawer's, whatever else it was taken for; what only seems to is left
+alone."""
 
 import numpy as np
 import pytest
@@ -34,7 +35,9 @@ FLAP = ([-0.4, -0.4, 0.33], [0.5, 0, 0], [0, 0.8, 0])  # on top, turns up
 def motions() -> torch.Tensor:
     slide = torch.eye(4, dtype=torch.float64)
     slide[0, 3] = TRAVEL
-    return torch.stack([slide, se3.from_screw(torch.tensor([0.0, 1, 0]).double(), torch.tensor([-0.4, 0, 0.33]).double(), -1.2)])
+    return torch.stack(
+        [slide, se3.from_screw(torch.tensor([0.0, 1, 0]).double(), torch.tensor([-0.4, 0, 0.33]).double(), -1.2)]
+    )
 
 
 def panels(sides):
@@ -65,7 +68,9 @@ def test_patches_on_an_open_drawer_are_the_drawers(time, shut_at):
     obj, drawn = twin(time, shut_at), 1.0 - shut_at
     cameras = [(s, c) for s in (0, 1) for c in ring(10, 200, elevations=(15.0, 45.0))]
     labels, held = in_trays(obj, cameras)
-    assert torch.equal(labels, obj.part_ids) and (obj.part_ids[held] == 1).all() and held.sum() > 0.3 * (labels == 1).sum()
+    assert (
+        torch.equal(labels, obj.part_ids) and (obj.part_ids[held] == 1).all() and held.sum() > 0.3 * (labels == 1).sum()
+    )
     right = obj.part_ids.clone()
     at = in_the_drawer(obj, shut_at, drawn)
     side = (right == 1) & ((at[:, 1] - 0.32).abs() < 0.01) & (at[:, 0] > 0.2) & (at[:, 0] < 0.45) & (at[:, 2] < 0.0)

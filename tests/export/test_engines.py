@@ -67,7 +67,11 @@ def test_another_part_in_the_way_is_found(name, tmp_path):
     """It is held where it was photographed."""
     floor, box = block((-2, -2, -9), (2, 2, -8.9)), block((-0.2, -0.3, -0.1), (0.2, 0.3, 0.1))
     near = block((-0.3, -0.8, -0.1), (0.3, -0.7, 0.1))
-    links = [link("base", [floor]), link("part_1", [box], slide((0, -1, 0), 0.8)), link("part_2", [near], slide((0, -1, 0), 0.8))]
+    links = [
+        link("base", [floor]),
+        link("part_1", [box], slide((0, -1, 0), 0.8)),
+        link("part_2", [near], slide((0, -1, 0), 0.8)),
+    ]
     folder = write(links, tmp_path)
     facts = [replace(f, end=0.0) for f in joint_facts(folder / "twin.urdf")]  # with no other recorded state
     reached = run_engine(name, ENGINES[name](folder), facts).reached["joint_1"]
@@ -90,7 +94,9 @@ def test_what_slides_down_is_found(name, tmp_path):
     if not installed(name):
         pytest.skip(f"{name} is not installed (pip install p2gs[validate])")
     floor, box = block((-2, -2, -9), (2, 2, -8.9)), block((-0.2, -0.3, -0.1), (0.2, 0.3, 0.1))
-    result = check_engine(name, write([link("base", [floor]), link("part_1", [box], slide((0, 0, -1), 30.0))], tmp_path))
+    result = check_engine(
+        name, write([link("base", [floor]), link("part_1", [box], slide((0, 0, -1), 30.0))], tmp_path)
+    )
     assert result.speed[0] > 1 and any("still moves" in p for p in result.problems)
 
 
@@ -113,7 +119,8 @@ def test_the_command_prints_a_table_and_says_by_its_exit_code_whether_all_is_wel
 
 @pytest.mark.parametrize("lid", [False, True])
 def test_a_ball_dropped_into_an_open_drawer_stays_in_it(lid, tmp_path):
-    """The drawer's pieces are made of points on its surface, as exports make them; a lid over it is what the test must notice."""
+    """The drawer's pieces are made of points on its surface, as exports make them; a lid over it is what the test must
+    notice."""
     import mujoco
 
     lo, hi = np.array([0.05, -0.4, -0.2]), np.array([0.45, 0.3, 0.1])

@@ -67,7 +67,8 @@ def test_a_perfect_twin_scores_perfectly(run):
 
 
 def test_a_twin_with_a_wrong_joint_scores_worse_where_it_should(run):
-    """The drawer slides 0.1 too far: its motion error is 0.1, the end state's pictures suffer, the start state's do not."""
+    """The drawer slides 0.1 too far: its motion error is 0.1, the end state's pictures suffer, the start state's do
+    not."""
     twin = object_to_input(toy_twin())
     joint = twin.parts[2].joint
     T = joint.transform.clone()
@@ -107,7 +108,9 @@ def true_meshes(folder, t):
         u, v = (torch.eye(3)[g.log_scales.argsort(1, descending=True)[:, i]] * 0.025 for i in (0, 1))
         a = t * math.radians(-70) if k == 1 else 0.0
         R = torch.tensor([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
-        corners = torch.stack([g.means + s * (u @ R.T) + w * (v @ R.T) for s, w in ((-1, -1), (1, -1), (1, 1), (-1, 1))], 1).reshape(-1, 3)
+        corners = torch.stack(
+            [g.means + s * (u @ R.T) + w * (v @ R.T) for s, w in ((-1, -1), (1, -1), (1, 1), (-1, 1))], 1
+        ).reshape(-1, 3)
         quads = 4 * torch.arange(len(g))[:, None, None] + torch.tensor([[0, 1, 2], [0, 2, 3]])
         mesh = trimesh.Trimesh(corners.numpy(), quads.reshape(-1, 3).numpy(), process=False)
         paths.append(folder / f"{t}_{k}.ply")
@@ -116,7 +119,9 @@ def true_meshes(folder, t):
 
 
 def test_meshes_are_scored_against_the_true_ones(run, tmp_path, scene):
-    folder = run(truth=GroundTruth(tmp_path, tuple(start_parts()[1]), true_meshes(tmp_path, 0.0), true_meshes(tmp_path, 1.0)))
+    folder = run(
+        truth=GroundTruth(tmp_path, tuple(start_parts()[1]), true_meshes(tmp_path, 0.0), true_meshes(tmp_path, 1.0))
+    )
     write_meshes(folder, resolution=40)
     c = evaluate.evaluate_run(folder)["chamfer"]
     assert c["failures"] == 0 and len(c["parts"]) == 2

@@ -21,4 +21,6 @@ def test_faces_are_where_and_as_large_as_trimesh_says_in_any_frame():
 def test_a_quantile_by_weight_is_that_of_repeated_values(share):
     rng = np.random.default_rng(0)
     values, weights = rng.normal(size=50), rng.integers(1, 9, 50)
-    assert quantile(values, weights.astype(float), share) == np.quantile(np.repeat(values, weights), share, method="inverted_cdf")
+    assert quantile(values, weights.astype(float), share) == np.quantile(
+        np.repeat(values, weights), share, method="inverted_cdf"
+    )

@@ -50,8 +50,21 @@ def test_a_new_twin_removes_what_was_made_of_the_old_one(tmp_path):
 
 def test_write_twin_leaves_the_contract(run):
     names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
-    media = {"start", "end", "parts_start", "parts_end", "states", "compare", *(f"parts_t{t:03d}" for t in (0, 25, 50, 75, 100))}
-    want = {"twin.json", "cameras.json", *(f"splats/{s}.ply" for s in ("canonical", "start", "end")), *(f"media/{m}.png" for m in media)}
+    media = {
+        "start",
+        "end",
+        "parts_start",
+        "parts_end",
+        "states",
+        "compare",
+        *(f"parts_t{t:03d}" for t in (0, 25, 50, 75, 100)),
+    }
+    want = {
+        "twin.json",
+        "cameras.json",
+        *(f"splats/{s}.ply" for s in ("canonical", "start", "end")),
+        *(f"media/{m}.png" for m in media),
+    }
     assert names == want
     assert len(load_twin(run).gaussians) == len(toy_twin().gaussians)
 
@@ -149,7 +162,8 @@ def test_part_coloured_has_no_view_dependence():
 
 
 def test_compare_puts_the_photograph_of_the_state_first(run):
-    """The first cell of each row is that state's photograph: it equals the twin's render beside it, and the rows differ."""
+    """The first cell of each row is that state's photograph: it equals the twin's render beside it, and the rows
+    differ."""
     image = read(run / "media" / "compare.png")
     cell = (image.shape[1] - 12) // 3
     row = 26 + 512
@@ -189,7 +203,12 @@ def test_h264_where_imageio_ffmpeg_is_there(tmp_path):
     reader = ffmpeg.read_frames(str(path), pix_fmt="rgb24")
     about = next(reader)
     frames = [np.frombuffer(f, np.uint8).reshape(32, 64, 3) for f in reader]
-    assert path.suffix == ".mp4" and about["codec"] == "h264" and about["pix_fmt"].startswith("yuv420p") and len(frames) == 24
+    assert (
+        path.suffix == ".mp4"
+        and about["codec"] == "h264"
+        and about["pix_fmt"].startswith("yuv420p")
+        and len(frames) == 24
+    )
     assert np.abs(frames[5].astype(int) - np.roll(ramp, 20, axis=1)).mean() < 8
 
 

@@ -27,7 +27,10 @@ RADIUS, VOXEL = 0.5, 0.04
 
 def ball_view(camera, center=(0.0, 0.0, 0.0), label=0):
     """Exact depth of a ball."""
-    rays, c = camera_rays(camera).double(), camera.viewmat[:3, :3].double() @ torch.tensor(center).double() + camera.viewmat[:3, 3].double()
+    rays, c = (
+        camera_rays(camera).double(),
+        camera.viewmat[:3, :3].double() @ torch.tensor(center).double() + camera.viewmat[:3, 3].double(),
+    )
     a, b, q = (rays * rays).sum(-1), (rays @ c), c @ c - RADIUS**2
     disc = b * b - a * q
     depth = torch.where(disc > 0, (b - disc.clamp_min(0).sqrt()) / a, torch.zeros_like(disc)).float()
@@ -44,9 +47,11 @@ def test_a_ball_comes_back_as_a_closed_ball():
     views = [ball_view(c) for c in cameras_all_round()]
     mesh = fuse(views, [EYE] * len(views), 0, VOXEL, 4 * VOXEL, 2 * VOXEL)
     radius = np.linalg.norm(mesh.vertices, axis=1)
-    assert abs(radius - RADIUS).max() < 0.5 * VOXEL and abs(radius.mean() - RADIUS) < 0.15 * VOXEL  # planes on a curved thing
+    # planes on a curved thing
+    assert abs(radius - RADIUS).max() < 0.5 * VOXEL and abs(radius.mean() - RADIUS) < 0.15 * VOXEL
     ball = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    assert ball.is_watertight and math.isclose(ball.volume, 4 / 3 * math.pi * RADIUS**3, rel_tol=0.05)  # > 0: faces look outward
+    # > 0: faces look outward
+    assert ball.is_watertight and math.isclose(ball.volume, 4 / 3 * math.pi * RADIUS**3, rel_tol=0.05)
     assert np.abs(mesh.colours / 255 - (mesh.vertices * 0.5 + 0.5)).max() < 0.06  # colours were painted by position
 
 
@@ -94,7 +99,11 @@ def test_a_thin_plate_keeps_its_two_sides():
         views.append(add_normals(DepthView(camera, depth, torch.where(ok, 0, -1), torch.ones(100, 100, 3)), 2 * VOXEL))
     mesh = fuse(views, [EYE, EYE], 0, VOXEL, 4 * VOXEL, 2 * VOXEL)
     inner = mesh.vertices[(np.abs(mesh.vertices[:, [0, 2]]) < 0.3).all(1)]
-    assert abs(np.abs(inner[:, 1]) - thick / 2).max() < 0.25 * VOXEL and (inner[:, 1] > 0).any() and (inner[:, 1] < 0).any()
+    assert (
+        abs(np.abs(inner[:, 1]) - thick / 2).max() < 0.25 * VOXEL
+        and (inner[:, 1] > 0).any()
+        and (inner[:, 1] < 0).any()
+    )
 
 
 def test_grid_holds_every_voxel_near_a_point():
@@ -156,7 +165,8 @@ def sheet(z, opacity, n=41):
 
 
 def test_fog_is_no_surface_and_two_surfaces_have_no_mean():
-    """A firm sheet is trusted; one behind a thin veil is found at its own depth or the veil's, never between; fog is not trusted."""
+    """A firm sheet is trusted; one behind a thin veil is found at its own depth or the veil's, never between; fog is
+    not trusted."""
     camera = look_at((0.01, 0.0, 2.0), (0, 0, 0), 64)
     middle = (slice(28, 36), slice(28, 36))
 
@@ -188,7 +198,8 @@ def run(tmp_path_factory):
 
 
 def test_cabinet_meshes_lie_on_its_panels(run):
-    """Every vertex of a part's mesh is near one of that part's panels, in both states; and the part's visible front is there."""
+    """Every vertex of a part's mesh is near one of that part's panels, in both states; and the part's visible front is
+    there."""
     panels, joints = start_parts()
     twin = object_to_input(toy_twin())
     for state, t in (("start", 0.0), ("end", 1.0)):

@@ -1,4 +1,5 @@
-"""Parts are called what a person would call them, whichever axis is up; names reach every file and never the run's own."""
+"""Parts are called what a person would call them, whichever axis is up; names reach every file and never the run's
+own."""
 
 import json
 
@@ -17,7 +18,11 @@ from p2gs.export.physics.inertia import Inertia
 from p2gs.ops.mesh import Mesh
 from p2gs.types import UserError
 
-CYCLE = {"z": np.eye(3), "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), "y": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])}
+CYCLE = {
+    "z": np.eye(3),
+    "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+    "y": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),
+}
 
 
 def shown(name, lo, hi, hinge=None, up="z") -> Link:
@@ -28,7 +33,9 @@ def shown(name, lo, hi, hinge=None, up="z") -> Link:
     visual = Mesh((mesh.vertices - at) @ R.T, np.array(mesh.faces), np.full((len(mesh.vertices), 3), 128, np.uint8))
     if hinge is not None:
         hinge = Hinge(hinge.type, R @ hinge.axis, R @ at, hinge.lower, hinge.upper, hinge.motion, 1.0)
-    return Link(name, int(name[-1]) if hinge else 0, visual, [], Inertia(1.0, np.zeros(3), np.eye(3)), hinge, (0.5, 0.5, 0.5))
+    return Link(
+        name, int(name[-1]) if hinge else 0, visual, [], Inertia(1.0, np.zeros(3), np.eye(3)), hinge, (0.5, 0.5, 0.5)
+    )
 
 
 BODY = ((-0.5, -0.4, -0.5), (0.5, 0.4, 0.5))
@@ -61,7 +68,10 @@ def test_a_part_is_called_what_it_is(case, up):
 
 def test_names_are_single_and_the_users_word_holds():
     links = [shown("base", *BODY)]
-    links += [shown(f"part_{i}", (-0.4, -0.42, z), (0.4, 0.3, z + 0.1), slide((0, -1, 0), 0.4)) for i, z in ((1, 0.1), (2, 0.3))]
+    links += [
+        shown(f"part_{i}", (-0.4, -0.42, z), (0.4, 0.3, z + 0.1), slide((0, -1, 0), 0.4))
+        for i, z in ((1, 0.1), (2, 0.3))
+    ]
     links += [shown("part_3", *PARTS["door"][:2], PARTS["door"][2])]
     asset = Asset("cabinet", links, "z", [("part_1", "part_3")], {"part_2": 0.1})
     named = with_names(asset)
@@ -74,7 +84,9 @@ def test_names_are_single_and_the_users_word_holds():
         with_names(asset, {"part_7": "door"})
 
 
-@pytest.mark.parametrize("word, told", [("door", "expected PART=NAME"), ("part_1=2nd", "no digit comes first"), ("part_1=a b", "letters")])
+@pytest.mark.parametrize(
+    "word, told", [("door", "expected PART=NAME"), ("part_1=2nd", "no digit comes first"), ("part_1=a b", "letters")]
+)
 def test_a_wrong_name_gets_a_sentence(word, told):
     with pytest.raises(UserError, match=told):
         parse_names([word])

@@ -69,7 +69,9 @@ def test_mass_goes_by_the_material(run):
     for a, b in zip(light.links, heavy.links, strict=True):
         assert b.inertia.mass / a.inertia.mass == pytest.approx(DENSITIES["glass"] / DENSITIES["chipboard"])
         if a.joint is not None:  # holds its own weight's fiftieth, whatever it weighs
-            assert a.joint.friction > 0 and b.joint.friction / a.joint.friction == pytest.approx(b.inertia.mass / a.inertia.mass)
+            assert a.joint.friction > 0 and b.joint.friction / a.joint.friction == pytest.approx(
+                b.inertia.mass / a.inertia.mass
+            )
 
 
 def test_usd_meshes_have_extents_and_normals(run, tmp_path):

@@ -1,4 +1,5 @@
-"""What slides through something that hides its middle is joined along its axis; what is seen to be apart or is one piece stays so."""
+"""What slides through something that hides its middle is joined along its axis; what is seen to be apart or is one
+piece stays so."""
 
 import numpy as np
 import pytest
@@ -61,7 +62,9 @@ def tube(lo, hi, wide=0.1, narrow=None):
     t = trimesh.creation.cylinder(1.0, 1.0, sections=24).subdivide_to_size(0.02, max_iter=20)
     x = lo + (t.vertices[:, 2] + 0.5) * (hi - lo)
     radius = np.interp(x, [lo, (lo + hi) / 2, hi], [wide, narrow or wide, wide])[:, None]
-    return Mesh(np.column_stack([x, radius * t.vertices[:, :2]]), np.asarray(t.faces), np.zeros((len(t.vertices), 3), np.uint8))
+    return Mesh(
+        np.column_stack([x, radius * t.vertices[:, :2]]), np.asarray(t.faces), np.zeros((len(t.vertices), 3), np.uint8)
+    )
 
 
 def pieces(*meshes):

@@ -24,7 +24,13 @@ from p2gs.export.metadata import read_meta
 from p2gs.export.physics.inertia import GRAVITY, enclosed, inertia_of
 from p2gs.types import UserError
 
-META = {"author": "Jane Doe", "asset_license": "CC-BY-4.0", "category": "StorageFurniture", "qcode": "Q10498396", "year": 2026}
+META = {
+    "author": "Jane Doe",
+    "asset_license": "CC-BY-4.0",
+    "category": "StorageFurniture",
+    "qcode": "Q10498396",
+    "year": 2026,
+}
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +67,12 @@ def test_partnets_urdf_moves_as_the_twin_does(run, partnet):
     assert np.allclose(robot.scene.bounds, [want.min(0), want.max(0)], atol=1e-4)
     start = [robot.get_transform(f"link_{i}", "base") for i in range(2)]
     joints = twin_joints(run)
-    robot.update_cfg({f"joint_{i}": math.radians(j["motion"]) if j["type"] == "revolute" else j["motion"] for i, j in enumerate(joints)})
+    robot.update_cfg(
+        {
+            f"joint_{i}": math.radians(j["motion"]) if j["type"] == "revolute" else j["motion"]
+            for i, j in enumerate(joints)
+        }
+    )
     for i, joint in enumerate(joints):
         T = np.eye(4)
         T[:3, :3] = TURN
@@ -70,13 +81,23 @@ def test_partnets_urdf_moves_as_the_twin_does(run, partnet):
 
 
 def test_partnets_other_files_agree_with_it(run, partnet):
-    assert (partnet / "semantics.txt").read_text().splitlines() == ["link_0 hinge door", "link_1 slider tray", "link_2 heavy body"]
+    assert (partnet / "semantics.txt").read_text().splitlines() == [
+        "link_0 hinge door",
+        "link_1 slider tray",
+        "link_2 heavy body",
+    ]
     entries = json.loads((partnet / "mobility_v2.json").read_text())
-    assert [(e["id"], e["parent"], e["joint"]) for e in entries] == [(0, 2, "hinge"), (1, 2, "slider"), (2, -1, "heavy")]
+    assert [(e["id"], e["parent"], e["joint"]) for e in entries] == [
+        (0, 2, "hinge"),
+        (1, 2, "slider"),
+        (2, -1, "heavy"),
+    ]
     Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     for entry, joint in zip(entries, twin_joints(run), strict=False):
         axis, limit = entry["jointData"]["axis"], entry["jointData"]["limit"]
-        assert np.allclose(axis["direction"], Y_UP @ joint["axis"]) and np.allclose(axis["origin"], Y_UP @ joint["origin"], atol=1e-6)
+        assert np.allclose(axis["direction"], Y_UP @ joint["axis"]) and np.allclose(
+            axis["origin"], Y_UP @ joint["origin"], atol=1e-6
+        )
         assert np.allclose(sorted([limit["a"], limit["b"]]), sorted(joint["limits"]))  # degrees and units of length
     tree = json.loads((partnet / "result.json").read_text())[0]["children"]
     assert [c["id"] for c in tree] == [e["parts"][0]["id"] for e in entries]
@@ -121,14 +142,18 @@ def test_simready_has_its_folders_metadata_labels_and_thumbnail(run, tmp_path):
     assert list(stage.GetDefaultPrim().GetAttribute("semantics:labels:wikidata_qcode").Get()) == ["Q10498396"]
     looks = [p for p in stage.Traverse() if p.IsA(UsdShade.Material)]
     assert len(looks) == 4 and all(list(p.GetAttribute("semantics:labels:material").Get()) == ["wood"] for p in looks)
-    for prim in (p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)):  # SimReady's rule VG.002 compares them as they are written
+    # SimReady's rule VG.002 compares them as they are written
+    for prim in (p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)):
         assert (
-            UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default()) == prim.GetAttribute("extent").Get()
+            UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
+            == prim.GetAttribute("extent").Get()
         )
     colliders = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.CollisionAPI)]
     for prim in colliders:
         contact = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
-        assert contact.GetName() == "contact" and UsdPhysics.MaterialAPI(contact).GetDynamicFrictionAttr().Get() == pytest.approx(0.6)
+        assert contact.GetName() == "contact" and UsdPhysics.MaterialAPI(
+            contact
+        ).GetDynamicFrictionAttr().Get() == pytest.approx(0.6)
     context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
     assert [e.GetMessage() for e in context.Validate(stage)] == []
 
@@ -170,7 +195,9 @@ def test_metadata_may_be_json_and_dates_are_texts(tmp_path):
     assert read_meta(tmp_path / "a.yaml") == {"made": "2026-11-23", "mass_measured": 12.5}
 
 
-@pytest.mark.parametrize("text, name", [("Toy cabinet", "toy_cabinet"), ("7 drawers", "asset_7_drawers"), ("Küche/2", "k_che_2")])
+@pytest.mark.parametrize(
+    "text, name", [("Toy cabinet", "toy_cabinet"), ("7 drawers", "asset_7_drawers"), ("Küche/2", "k_che_2")]
+)
 def test_file_names_are_what_every_system_takes(text, name):
     assert file_name(text) == name
 
@@ -190,7 +217,8 @@ def test_the_base_stands_fast_or_floats(fixed, tmp_path):
     for _ in range(50):
         mujoco.mj_step(model, data)
     assert (data.body("base").xpos[2] < -0.01) == (fixed is False)  # in free fall after 0.1 s: 5 cm
-    filtered = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT  # as it does not where the parent stands fast
+    # as it does not where the parent stands fast
+    filtered = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     assert filtered == (fixed is not False)
     assert ("PhysicsFixedJoint" in write_usd(asset, tmp_path).read_text()) == (fixed is not False)
 

@@ -1,4 +1,5 @@
-"""The surfaces that ArtGS's protocol scores: nothing completed, the whole by itself, moving parts cleaned of stray Gaussians."""
+"""The surfaces that ArtGS's protocol scores: nothing completed, the whole by itself, moving parts cleaned of stray
+Gaussians."""
 
 import pytest
 from toy import toy_scene, toy_twin
@@ -15,7 +16,9 @@ from p2gs.types import UserError
 
 def test_options_are_read_from_the_runs_config(tmp_path):
     assert surface_options(tmp_path) == SurfaceOptions()
-    (tmp_path / "config.yaml").write_text("phases: {finish: {complete: false, whole: separate, cluster: 0.05, trays: 0}}")
+    (tmp_path / "config.yaml").write_text(
+        "phases: {finish: {complete: false, whole: separate, cluster: 0.05, trays: 0}}"
+    )
     assert surface_options(tmp_path) == SurfaceOptions(False, "separate", 0.05)
     (tmp_path / "config.yaml").write_text("phases: [1]")
     with pytest.raises(UserError, match="expected a mapping"):
@@ -30,8 +33,11 @@ def test_a_moving_part_keeps_its_largest_cluster():
     for rows in (stray, base):
         twin.gaussians.means[rows] += 50.0
     kept = largest_clusters(twin, 0.5)
-    assert len(kept.gaussians) == len(twin.gaussians) - 2  # a pair far off is a cluster too, but not the largest; the base keeps all
-    assert int((kept.part_ids == part.id).sum()) == len(mine) - 2 and kept.gaussians.means[kept.part_ids == 0].max() > 40
+    # a pair far off is a cluster too, but not the largest; the base keeps all
+    assert len(kept.gaussians) == len(twin.gaussians) - 2
+    assert (
+        int((kept.part_ids == part.id).sum()) == len(mine) - 2 and kept.gaussians.means[kept.part_ids == 0].max() > 40
+    )
 
 
 def test_nothing_is_completed_where_it_is_not_wanted():
@@ -71,4 +77,7 @@ def test_the_whole_of_its_own_is_written_and_scored(tmp_path):
     apart = surface_scores(tmp_path, Truth, assignment, [])
     (tmp_path / "config.yaml").write_text("phases: {finish: {complete: false}}")
     together = surface_scores(tmp_path, Truth, assignment, [])
-    assert apart["static"]["value"] == together["static"]["value"] and apart["whole"]["value"] > 1.2 * together["whole"]["value"]
+    assert (
+        apart["static"]["value"] == together["static"]["value"]
+        and apart["whole"]["value"] > 1.2 * together["whole"]["value"]
+    )

@@ -19,7 +19,9 @@ def test_a_slide_stops_in_front_of_a_wall_on_either_side():
     base, box = extend_links(links)
     assert base.joint is None
     m = margin(links)
-    assert box.joint.upper == pytest.approx(0.5 - m, abs=2e-3) and box.joint.lower == pytest.approx(-(0.2 - m), abs=2e-3)
+    assert box.joint.upper == pytest.approx(0.5 - m, abs=2e-3) and box.joint.lower == pytest.approx(
+        -(0.2 - m), abs=2e-3
+    )
     assert box.joint.upper <= 0.5 - m and box.joint.motion == 0.1  # never into the wall; what was observed is kept
 
 
@@ -35,7 +37,10 @@ def test_a_door_stops_at_the_frame_and_at_a_post(sign):
     """Shut it lies against a frame; open, a post stands at 135 degrees."""
     frame = block((0.0, 0.02, -0.5), (1.0, 0.05, 0.5))
     at = np.deg2rad(-135)
-    post = block((0.7 * np.cos(at) - 0.02, 0.7 * np.sin(at) - 0.02, -0.5), (0.7 * np.cos(at) + 0.02, 0.7 * np.sin(at) + 0.02, 0.5))
+    post = block(
+        (0.7 * np.cos(at) - 0.02, 0.7 * np.sin(at) - 0.02, -0.5),
+        (0.7 * np.cos(at) + 0.02, 0.7 * np.sin(at) + 0.02, 0.5),
+    )
     door = block((0.01, -0.005, -0.4), (0.9, 0.005, 0.4))
     links = [link("base", [frame, post]), link("part_1", [door], turn((0, 0, sign), (0, 0, 0), -sign * np.deg2rad(60)))]
     joint = extend_links(links)[1].joint
@@ -59,7 +64,11 @@ def test_each_end_is_followed_among_the_others_as_they_were_there():
     sill = block((-0.5, -0.5, -1.0), (0.5, 3.0, -0.9))
     own = block((-0.2, 0.0, -0.3), (0.2, 0.5, 0.0))
     bar = block((-0.2, 1.0, 0.5), (0.2, 1.1, 0.9))
-    links = [link("base", [sill]), link("part_1", [own], slide((0, 1, 0), 0.2)), link("part_2", [bar], slide((0, 0, -1), 0.7))]
+    links = [
+        link("base", [sill]),
+        link("part_1", [own], slide((0, 1, 0), 0.2)),
+        link("part_2", [bar], slide((0, 0, -1), 0.7)),
+    ]
     first = extend_links(links)[1].joint
     assert first.upper == pytest.approx(0.5 - margin(links), abs=5e-3)  # the bar has come down by then
     assert first.lower == pytest.approx(-0.5 - 0.5 * (1 - HELD) + 0.0, abs=1e-6)

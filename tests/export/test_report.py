@@ -1,4 +1,5 @@
-"""The page about a run: what it says, that nothing in it comes from elsewhere, and, where there is a browser, that it works."""
+"""The page about a run: what it says, that nothing in it comes from elsewhere, and, where there is a browser, that it
+works."""
 
 import base64
 import http.server
@@ -24,7 +25,12 @@ METRICS = {
     "chamfer": {k: {"value": 1.5, "floor": 0.4} for k in ("static", "movable", "whole")},
     "joints": {
         "joints": [
-            {"gt": 0, "pred": 0, "pred_type": "revolute", "errors": {"axis_angle": 0.123, "axis_position": 0.045, "motion": 0.067}},
+            {
+                "gt": 0,
+                "pred": 0,
+                "pred_type": "revolute",
+                "errors": {"axis_angle": 0.123, "axis_position": 0.045, "motion": 0.067},
+            },
             {"gt": 1, "pred": 1, "pred_type": "prismatic", "errors": None},
         ]
     },
@@ -38,7 +44,9 @@ def run(tmp_path_factory):
     write_twin(toy_twin(), folder, toy_scene(n=8, size=96))
     write_meshes(folder, resolution=36)
     (folder / "logs" / "articulation").mkdir(parents=True)
-    (folder / "logs" / "stages.json").write_text(json.dumps({"single_state_0": {"seconds": 12.5, "peak_memory_mib": 900}}))
+    (folder / "logs" / "stages.json").write_text(
+        json.dumps({"single_state_0": {"seconds": 12.5, "peak_memory_mib": 900}})
+    )
     from torch.utils.tensorboard import SummaryWriter
 
     with SummaryWriter(folder / "logs" / "articulation") as log:
@@ -84,7 +92,11 @@ def test_chart_leaves_out_what_a_logarithm_cannot_show():
     svg = chart({"a": np.array([[0, 1.0], [10, 0.1], [20, 0.0], [30, np.nan]]), "b": np.array([[0, -1.0], [1, 0.0]])})
     assert svg.count('stroke="#') == 1 and ">a</text>" in svg and ">b</text>" not in svg and "10 steps" in svg
     assert chart({"b": np.array([[0, 0.0]])}) == ""
-    assert is_loss("articulation/render") and not is_loss("articulation/gaussians") and not is_loss("articulation/joint/1/motion")
+    assert (
+        is_loss("articulation/render")
+        and not is_loss("articulation/gaussians")
+        and not is_loss("articulation/joint/1/motion")
+    )
 
 
 def chromium():
@@ -101,8 +113,19 @@ def test_in_a_browser_the_slider_moves_the_part(run, tmp_path):
     browser, page, shots = chromium(), write_report(run), []
     for state in ("1=0", "1=1"):
         shot = tmp_path / f"{state}.png"
-        flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--enable-logging=stderr"]
-        flags += ["--window-size=500,700", "--virtual-time-budget=2000", f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={shot}"]
+        flags = [
+            "--headless=new",
+            "--no-sandbox",
+            "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader",
+            "--enable-logging=stderr",
+        ]
+        flags += [
+            "--window-size=500,700",
+            "--virtual-time-budget=2000",
+            f"--user-data-dir={tmp_path / 'profile'}",
+            f"--screenshot={shot}",
+        ]
         done = subprocess.run([browser, *flags, f"file://{page}#{state}"], capture_output=True, text=True, timeout=90)
         said = [line for line in done.stderr.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
         assert said == []
@@ -136,8 +159,8 @@ WATCH = """<script>(function () {  // posts both canvases once the splats are th
 
 @pytest.fixture
 def watched(run, tmp_path):
-    """What the page posts in a headless Chromium: pictures [H, W, 4] of the two canvases with joint 1 at its start and at its end, and
-    what the page loaded."""
+    """What the page posts in a headless Chromium: pictures [H, W, 4] of the two canvases with joint 1 at its start and
+    at its end, and what the page loaded."""
     browser, page = chromium(), (write_report(run).read_text() + WATCH).encode()
     posts: queue.Queue = queue.Queue()
 
@@ -158,7 +181,13 @@ def watched(run, tmp_path):
 
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    flags = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--remote-debugging-port=0"]
+    flags = [
+        "--headless",
+        "--no-sandbox",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--remote-debugging-port=0",
+    ]
     flags += ["--window-size=500,700", f"--user-data-dir={tmp_path / 'profile'}"]
     address = f"http://127.0.0.1:{server.server_port}/"
     with subprocess.Popen([browser, *flags, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
@@ -194,4 +223,13 @@ def test_a_stage_run_again_draws_one_curve(tmp_path):
         for step in steps:
             writer.add_scalar("loss/render", 10.0 * sitting + step, step, walltime=1000.0 * sitting + step)
         writer.close()
-    assert read_scalars(tmp_path)["loss/render"].tolist() == [[0, 0], [1, 1], [2, 2], [3, 3], [4, 14], [5, 15], [6, 16], [7, 17]]
+    assert read_scalars(tmp_path)["loss/render"].tolist() == [
+        [0, 0],
+        [1, 1],
+        [2, 2],
+        [3, 3],
+        [4, 14],
+        [5, 15],
+        [6, 16],
+        [7, 17],
+    ]

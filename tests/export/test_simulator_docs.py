@@ -68,7 +68,10 @@ def test_sapien(twin):
             element.remove(visual)
     tree.write("twin.urdf")
     lines = lines_of("sapien")
-    assert "sapien.Scene()" in lines and "sapien.Scene([sapien.physx.PhysxCpuSystem()])" in (PAGES / "sapien.md").read_text()
+    assert (
+        "sapien.Scene()" in lines
+        and "sapien.Scene([sapien.physx.PhysxCpuSystem()])" in (PAGES / "sapien.md").read_text()
+    )
     names = run_lines("sapien", lines.replace("sapien.Scene()", "sapien.Scene([sapien.physx.PhysxCpuSystem()])"))
     assert np.allclose(names["twin"].get_qpos(), twin, atol=0.01)
 

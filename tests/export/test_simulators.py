@@ -26,7 +26,8 @@ from p2gs.types import Similarity, UserError
 SIM = Similarity(2.0, (0.2, 0.1, -0.3))
 
 
-REAL = [p for p in os.environ.get("P2GS_RUNS", "").split(os.pathsep) if p]  # result folders to hold against the same readers
+# result folders to hold against the same readers
+REAL = [p for p in os.environ.get("P2GS_RUNS", "").split(os.pathsep) if p]
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +83,17 @@ def test_urdf_opens_in_yourdfpy_and_agrees_with_the_twin(run, joints):
     for k, joint in joints.items():
         got = robot.joint_map[f"joint_{k}"]
         assert np.allclose(got.axis, joint["axis"], atol=1e-6) and got.type == joint["type"]
-        assert np.allclose([got.limit.lower, got.limit.upper], sorted([0, si(joint)]), atol=1e-6) and float(got.dynamics.damping) > 0
+        assert (
+            np.allclose([got.limit.lower, got.limit.upper], sorted([0, si(joint)]), atol=1e-6)
+            and float(got.dynamics.damping) > 0
+        )
         start = np.eye(4)
         start[:3, 3] = joint["origin"]
         assert np.allclose(robot.get_transform(f"part_{k}", "base"), np.array(joint["transform"]) @ start, atol=1e-6)
     shape = robot.scene.to_geometry()
     want = trimesh.load(run / "meshes" / "end" / "whole.ply", process=False)
-    assert np.allclose(shape.bounds, want.bounds, atol=0.02)  # the visual meshes stand where the end state's meshes stand
+    # the visual meshes stand where the end state's meshes stand
+    assert np.allclose(shape.bounds, want.bounds, atol=0.02)
     for link in robot.link_map.values():
         assert link.inertial.mass > 0 and (np.linalg.eigvalsh(link.inertial.inertia) > 0).all()
         assert len(link.collisions) >= 1
@@ -120,7 +125,8 @@ def test_both_load_in_mujoco_and_agree_with_the_twin(run, joints, file):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_mjcf_runs_ten_seconds_under_gravity_and_force_within_its_limits(run, joints, sign):
-    """A force that would move each joint through its range in about a second pushes it, first to one end, then to the other."""
+    """A force that would move each joint through its range in about a second pushes it, first to one end, then to the
+    other."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(run / "twin.xml"))
@@ -172,7 +178,11 @@ def test_glb_has_a_node_per_part_and_an_animation(run, joints):
 
 def test_usd_text_is_complete(run, joints):
     text = (run / "twin.usda").read_text()
-    assert text.startswith("#usda 1.0") and text.count("{") == text.count("}") and text.count('def Mesh "visual"') == 1 + len(joints)
+    assert (
+        text.startswith("#usda 1.0")
+        and text.count("{") == text.count("}")
+        and text.count('def Mesh "visual"') == 1 + len(joints)
+    )
     assert all(f'def Physics{joint["type"].capitalize()}Joint "joint_{k}"' in text for k, joint in joints.items())
 
 
@@ -186,26 +196,38 @@ def test_usd_opens_in_usd_core_and_agrees_with_the_twin(run, joints):
         kind = UsdPhysics.RevoluteJoint if joint["type"] == "revolute" else UsdPhysics.PrismaticJoint
         got = kind(stage.GetPrimAtPath(f"/twin/joint_{k}"))
         limits = [got.GetLowerLimitAttr().Get(), got.GetUpperLimitAttr().Get()]
-        assert np.allclose(np.radians(limits) if joint["type"] == "revolute" else limits, sorted([0, si(joint)]), atol=1e-6)
-        axis = Gf.Quatd(got.GetLocalRot0Attr().Get()).GetNormalized().Transform(Gf.Vec3d(1, 0, 0))  # Gf.Rotation goes by acos
-        assert np.allclose(axis, joint["axis"], atol=1e-6) and np.allclose(got.GetLocalPos0Attr().Get(), joint["origin"], atol=1e-6)
+        assert np.allclose(
+            np.radians(limits) if joint["type"] == "revolute" else limits, sorted([0, si(joint)]), atol=1e-6
+        )
+        # Gf.Rotation goes by acos
+        axis = Gf.Quatd(got.GetLocalRot0Attr().Get()).GetNormalized().Transform(Gf.Vec3d(1, 0, 0))
+        assert np.allclose(axis, joint["axis"], atol=1e-6) and np.allclose(
+            got.GetLocalPos0Attr().Get(), joint["origin"], atol=1e-6
+        )
     cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])
     box = cache.ComputeWorldBound(stage.GetPrimAtPath("/twin")).ComputeAlignedRange()
     want = trimesh.load(run / "meshes" / "start" / "whole.ply", process=False).bounds
     assert np.allclose([box.GetMin(), box.GetMax()], want, atol=0.02)
 
 
-TURNS = {"z": np.eye(3), "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])}
+TURNS = {
+    "z": np.eye(3),
+    "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+}
 
 
 @pytest.mark.parametrize("up, origin, scale", [("y", "bottom", 0.5), ("x", "center", 2.0), ("z", "keep", 0.1)])
 def test_every_format_stands_where_scale_up_and_origin_say(run, joints, tmp_path, up, origin, scale):
-    """Joints and surfaces of URDF, MJCF, GLB and USD are those of twin.json under one and the same x -> scale R (x - origin)."""
+    """Joints and surfaces of URDF, MJCF, GLB and USD are those of twin.json under one and the same x -> scale R (x -
+    origin)."""
     import mujoco
     import yourdfpy
 
     export_run(run, ["urdf", "mjcf", "glb"], tmp_path, scale=scale, up=up, origin=origin)
-    points = np.concatenate([trimesh.load(run / "meshes" / "start" / f"part_{k}.ply", process=False).vertices for k in (0, *joints)])
+    points = np.concatenate(
+        [trimesh.load(run / "meshes" / "start" / f"part_{k}.ply", process=False).vertices for k in (0, *joints)]
+    )
     lo, hi = points.min(0), points.max(0)
     where = {"keep": np.zeros(3), "center": (lo + hi) / 2, "bottom": np.array([*(lo + hi)[:2] / 2, lo[2]])}[origin]
     R = TURNS[up]
@@ -249,7 +271,8 @@ def test_scale_up_and_origin(toy, tmp_path):
     lo, hi = points.min(0), points.max(0)
     assert abs(lo[1]) < 1e-6 and np.allclose((lo + hi)[[0, 2]], 0, atol=0.02) and (hi - lo).max() < 0.7
     drawer = asset.links[2].joint
-    assert math.isclose(drawer.motion, 0.2, rel_tol=1e-6) and np.allclose(drawer.axis, [0, 0, 1], atol=1e-6)  # -y comes to the viewer
+    # -y comes to the viewer
+    assert math.isclose(drawer.motion, 0.2, rel_tol=1e-6) and np.allclose(drawer.axis, [0, 0, 1], atol=1e-6)
     assert math.isclose(asset.links[1].joint.motion, math.radians(-70), rel_tol=1e-6)
     for bad, told in ((dict(up="w"), "--up is 'w'"), (dict(origin="left"), "--origin"), (dict(scale=0.0), "--scale")):
         with pytest.raises(UserError, match=told):

@@ -1,4 +1,5 @@
-"""splats.glb and the splats in USD: by other readers, the Gaussians of the twin in both states, in the parts' own frames."""
+"""splats.glb and the splats in USD: by other readers, the Gaussians of the twin in both states, in the parts' own
+frames."""
 
 import gzip
 import json
@@ -26,7 +27,8 @@ UPS = {"z": np.eye(3), "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
 
 
 def with_splats(up: str, scale: float = 0.5, degree: int = 2) -> tuple[Asset, ArticulatedObject]:
-    """The toy's joints and Gaussians (all of one shape and turn, so they get others) under links of the cabinet's names."""
+    """The toy's joints and Gaussians (all of one shape and turn, so they get others) under links of the cabinet's
+    names."""
     twin, g = toy_twin(sh_degree=degree), torch.Generator().manual_seed(0)
     n = len(twin.gaussians)
     twin.gaussians.quats = torch.randn(n, 4, generator=g)
@@ -39,9 +41,13 @@ def with_splats(up: str, scale: float = 0.5, degree: int = 2) -> tuple[Asset, Ar
         if part.joint is not None:
             j, unit = part.joint, np.pi / 180 if part.joint.type == "revolute" else scale
             axis, at, motion = place.vector(j.axis.numpy()), place.points(j.origin.numpy()), j.motion * unit
-            joint = replace(link.joint, type=j.type, axis=axis, origin=at, motion=motion, lower=min(motion, 0), upper=max(motion, 0))
+            joint = replace(
+                link.joint, type=j.type, axis=axis, origin=at, motion=motion, lower=min(motion, 0), upper=max(motion, 0)
+            )
         origin = np.zeros(3) if joint is None else joint.origin
-        links.append(replace(link, joint=joint, splats=place.gaussians(twin.gaussians[twin.part_ids == part.id], origin)))
+        links.append(
+            replace(link, joint=joint, splats=place.gaussians(twin.gaussians[twin.part_ids == part.id], origin))
+        )
     return Asset("cabinet", links, up), twin
 
 
@@ -73,13 +79,16 @@ def covariance(R, s):
 
 @pytest.mark.parametrize("state", [0, 1])
 def test_the_animation_shows_the_twins_gaussians_in_both_states(state, tmp_path):
-    """Centres, covariances, opacities and colours from all around of each node's splats, moved as the animation says."""
+    """Centres, covariances, opacities and colours from all around of each node's splats, moved as the animation
+    says."""
     asset, twin = with_splats("y")
     doc, array = read_glb(write_splats(asset, tmp_path))
     assert doc["extensionsUsed"] == ["KHR_gaussian_splatting"]
     want = pose(twin, float(state))
     channels = {c["target"]["node"]: c for c in doc["animations"][0]["channels"]}
-    directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=-1).double()
+    directions = torch.nn.functional.normalize(
+        torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=-1
+    ).double()
     for number, node in enumerate(doc["nodes"]):
         if "mesh" not in node:
             continue
@@ -131,7 +140,9 @@ def test_usd_has_the_gaussians_under_their_rigid_body(tmp_path):
         value = {n: prim.GetAttribute(n).Get() for n in ("positions", "orientations", "scales", "opacities")}
         place = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0)).T
         g = twin.gaussians[twin.part_ids == link.part]
-        assert np.allclose(np.array(value["positions"]) @ place[:3, :3].T + place[:3, 3], 0.5 * g.means.numpy(), atol=1e-5)
+        assert np.allclose(
+            np.array(value["positions"]) @ place[:3, :3].T + place[:3, 3], 0.5 * g.means.numpy(), atol=1e-5
+        )
         turn = np.array([[*q.GetImaginary(), q.GetReal()] for q in value["orientations"]])
         assert np.allclose(np.linalg.norm(turn, axis=1), 1, atol=1e-5)
         w, x, y, z = torch.nn.functional.normalize(g.quats, dim=-1).numpy().T
@@ -150,7 +161,8 @@ def test_usd_has_the_gaussians_under_their_rigid_body(tmp_path):
 
 
 def read_spz(path):
-    """Splat by splat after the description in github.com/nianticlabs/spz: centres, opacities, colours, scales, turns xyzw, coefficients."""
+    """Splat by splat after the description in github.com/nianticlabs/spz: centres, opacities, colours, scales, turns
+    xyzw, coefficients."""
     data = gzip.decompress(path.read_bytes())
     magic, version, n, degree, bits, flags, reserved = struct.unpack("<IIIBBBB", data[:16])
     assert (data[:4], version, flags, reserved) == (b"NGSP", 3, 0, 0) and magic == 0x5053474E
@@ -160,7 +172,9 @@ def read_spz(path):
     out = []
     for i in range(n):
         at = starts[0] + 9 * i
-        center = [int.from_bytes(data[at + 3 * k : at + 3 * k + 3], "little", signed=True) / (1 << bits) for k in range(3)]
+        center = [
+            int.from_bytes(data[at + 3 * k : at + 3 * k + 3], "little", signed=True) / (1 << bits) for k in range(3)
+        ]
         alpha = data[starts[1] + i] / 255
         colour = [(data[starts[2] + 3 * i + k] / 255 - 0.5) / 0.15 for k in range(3)]
         scale = [math.exp(data[starts[3] + 3 * i + k] / 16 - 10) for k in range(3)]
@@ -192,7 +206,9 @@ def test_spz_holds_the_gaussians_at_the_start_state(degree, tmp_path):
     far = np.linalg.norm(matrix(turn) - up @ matrix(np.stack([x, y, z, w], 1)), axis=(1, 2))
     assert far.max() < 0.006  # half a step of 1 / 722 in three components
     if degree:
-        ways = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=-1).double()
+        ways = torch.nn.functional.normalize(
+            torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=-1
+        ).double()
         sh = torch.from_numpy(np.concatenate([colour[:, None], rest.reshape(len(rest), -1, 3)], 1))
         exact = evaluate(g.sh.double()[:, None], ways @ torch.from_numpy(up))
         assert torch.allclose(evaluate(sh[:, None], ways), exact, atol=0.03)

@@ -61,7 +61,9 @@ def test_splat_reader_names_the_mistake(tmp_path):
     with pytest.raises(UserError, match="binary little-endian"):
         read_splat_ply(path)
     rows = np.zeros(1, [(n, "<f4") for n in splat_dtype(1, False).names if n != "scale_1"])
-    head = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n" + "".join(f"property float {n}\n" for n in rows.dtype.names)
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n" + "".join(
+        f"property float {n}\n" for n in rows.dtype.names
+    )
     path.write_bytes((head + "end_header\n").encode() + rows.tobytes())
     with pytest.raises(UserError, match="'scale_1' is missing"):
         read_splat_ply(path)
@@ -103,7 +105,9 @@ def test_pose_moves_each_part_along_its_screw():
                 want = x
             elif part.id == 1:  # 70 degrees about z through (-0.49, -0.43), negative sense
                 a = math.radians(-70 * t)
-                R = torch.tensor([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]], dtype=torch.float64)
+                R = torch.tensor(
+                    [[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]], dtype=torch.float64
+                )
                 o = torch.tensor([-0.49, -0.43, 0], dtype=torch.float64)
                 want = (x - o) @ R.T + o
             else:
@@ -143,7 +147,9 @@ def test_posed_colours_do_not_change_with_the_part():
     twin = toy_twin(sh_degree=3)
     door = twin.part_ids == 1
     T = part_transform(twin, 1, 1.0).float()
-    dirs = torch.nn.functional.normalize(torch.randn(int(door.sum()), 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    dirs = torch.nn.functional.normalize(
+        torch.randn(int(door.sum()), 3, generator=torch.Generator().manual_seed(1)), dim=-1
+    )
     before = evaluate(twin.gaussians.sh[door], dirs)
     after = evaluate(pose(twin, 1.0).sh[door], dirs @ T[:3, :3].T)
     assert torch.allclose(before, after, atol=1e-4)
@@ -159,8 +165,16 @@ def test_twin_json_is_the_contract_and_loads_back(tmp_path):
     data = json.loads((tmp_path / "twin.json").read_text())
     assert data["format"] == "p2gs-twin/1" and data["num_parts"] == 3 and data["parts"][0]["kind"] == "static"
     door, drawer = data["parts"][1]["joint"], data["parts"][2]["joint"]
-    assert door["type"] == "revolute" and math.isclose(door["motion"], -70) and np.allclose(door["origin"], [-0.49, -0.43, 0])
-    assert drawer["type"] == "prismatic" and math.isclose(drawer["motion"], 0.4) and np.allclose(drawer["limits"], [0, 0.4])
+    assert (
+        door["type"] == "revolute"
+        and math.isclose(door["motion"], -70)
+        and np.allclose(door["origin"], [-0.49, -0.43, 0])
+    )
+    assert (
+        drawer["type"] == "prismatic"
+        and math.isclose(drawer["motion"], 0.4)
+        and np.allclose(drawer["limits"], [0, 0.4])
+    )
     assert np.allclose(np.array(drawer["transform"])[:3, 3], [0, -0.4, 0])
     assert data["parts"][1]["gaussians"] == int((twin.part_ids == 1).sum())
 

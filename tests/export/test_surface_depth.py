@@ -16,7 +16,9 @@ from p2gs.types import GaussianTensors
 def gaussians(means, scales, quats=None, logit=4.0):
     n = len(means)
     quats = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1) if quats is None else quats
-    return GaussianTensors(means, quats, torch.as_tensor(scales).expand(n, 3).log(), torch.full((n,), logit), torch.zeros(n, 1, 3))
+    return GaussianTensors(
+        means, quats, torch.as_tensor(scales).expand(n, 3).log(), torch.full((n,), logit), torch.zeros(n, 1, 3)
+    )
 
 
 def plane_depth(camera, height):
@@ -33,7 +35,11 @@ def test_one_flat_gaussian_is_a_plane(elevation):
     depth, spread = surface_depth(g, camera)
     hit = draw(g, camera, 0.0).alpha > 0.05
     torch.testing.assert_close(depth[hit].double(), plane_depth(camera, 0.0)[hit], atol=2e-4, rtol=0)
-    assert hit.sum() > 100 and float(spread[hit].max()) < 2e-3 and float(depth[draw(g, camera, 0.0).alpha == 0].abs().max()) == 0
+    assert (
+        hit.sum() > 100
+        and float(spread[hit].max()) < 2e-3
+        and float(depth[draw(g, camera, 0.0).alpha == 0].abs().max()) == 0
+    )
 
 
 def test_grazed_surface_of_large_gaussians_is_where_it_is():
@@ -70,7 +76,8 @@ def test_two_layers_are_spread():
 
 
 def test_planes_are_where_rays_meet_most():
-    """Against the depth of greatest density along rays beside the middle, which differs from the plane's in second order only."""
+    """Against the depth of greatest density along rays beside the middle, which differs from the plane's in second
+    order only."""
     g = torch.Generator().manual_seed(2)
     mean = torch.tensor([[0.3, -0.2, 2.0]], dtype=torch.float64)
     quat = torch.nn.functional.normalize(torch.randn(1, 4, generator=g, dtype=torch.float64), dim=1)

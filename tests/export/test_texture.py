@@ -41,8 +41,10 @@ def test_no_triangle_shows_its_neighbours_colours(count):
     """Every triangle painted in one colour of its own, read anywhere in it, is of that colour."""
     (width, height), uv = layout(count)
     triangle, weights, place = texels(count)
-    assert place.min() >= 0 and (place < [width, height]).all() and len(np.unique(place, axis=0)) == len(place)  # no texel twice
-    assert all(n & (n - 1) == 0 for n in (width, height)) and count * TILE**2 / 2 > width * height / 2 - TILE**2  # at least half is used
+    # no texel twice
+    assert place.min() >= 0 and (place < [width, height]).all() and len(np.unique(place, axis=0)) == len(place)
+    # at least half is used
+    assert all(n & (n - 1) == 0 for n in (width, height)) and count * TILE**2 / 2 > width * height / 2 - TILE**2
     colours = np.random.default_rng(1).integers(0, 256, (count, 3)).astype(np.uint8)
     image = np.zeros((height, width, 3), np.uint8)
     image[place[:, 1], place[:, 0]] = colours[triangle]
@@ -60,7 +62,8 @@ def test_texels_lie_where_their_triangle_says(count):
     image[place[:, 1], place[:, 0]] = weights * 255
     which, w = within(count, 2000)
     off = np.abs(read(Texture(uv, image), (uv[which] * w[..., None]).sum(1)) - w)
-    assert np.median(off) < 1e-6 and off.max() < 0.5 / (TILE - 3)  # along the long edge: the nearest place in the triangle
+    # along the long edge: the nearest place in the triangle
+    assert np.median(off) < 1e-6 and off.max() < 0.5 / (TILE - 3)
 
 
 def striped(x: torch.Tensor) -> torch.Tensor:
@@ -74,7 +77,11 @@ def test_a_texture_is_finer_than_vertices():
     for c in ring(8, size, elevations=(60.0, 40.0)):
         view = seen(boards(((-0.5, -0.4, -0.1), (0.5, 0.4, 0.1))), 1, c, 2 * VOXEL)
         v, u = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
-        rays = torch.stack([u, v, torch.ones_like(u)], -1).double() @ torch.linalg.inv(c.K.double()).T * view.depth[..., None].double()
+        rays = (
+            torch.stack([u, v, torch.ones_like(u)], -1).double()
+            @ torch.linalg.inv(c.K.double()).T
+            * view.depth[..., None].double()
+        )
         view.colour = striped((rays - c.viewmat[:3, 3].double()) @ c.viewmat[:3, :3].double()).float()
         views.append(view)
     poses = [torch.eye(4, dtype=torch.float64)] * len(views)
@@ -113,7 +120,9 @@ def test_readers_see_the_same_texture_on_the_same_places(run):
     """URDF's meshes, the OBJ parts and the GLB, as trimesh reads them: the same colour everywhere."""
     glb = trimesh.load(run / "twin.glb")
     for name in ("base", "part_1", "part_2"):
-        files = [trimesh.load(run / folder / f"{name}.obj", process=False) for folder in ("assets", "parts")] + [glb.geometry[name]]
+        files = [trimesh.load(run / folder / f"{name}.obj", process=False) for folder in ("assets", "parts")] + [
+            glb.geometry[name]
+        ]
         which, w = within(len(files[0].faces), 500)
         colours = []
         for mesh in files:
@@ -145,7 +154,9 @@ def test_simulators_and_usd_find_the_pictures(run, tmp_path):
     for name in ("base", "part_1", "part_2"):
         mesh = stage.GetPrimAtPath(f"/twin/{name}/visual")
         st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
-        assert st.GetInterpolation() == "faceVarying" and len(st.Get()) == len(UsdGeom.Mesh(mesh).GetFaceVertexIndicesAttr().Get())
+        assert st.GetInterpolation() == "faceVarying" and len(st.Get()) == len(
+            UsdGeom.Mesh(mesh).GetFaceVertexIndicesAttr().Get()
+        )
         material = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0]
         shader = material.ComputeSurfaceSource()[0]
         picture = UsdShade.Shader(shader.GetInput("diffuseColor").GetConnectedSources()[0][0].source)

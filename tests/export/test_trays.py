@@ -1,4 +1,5 @@
-"""Drawers whose rear no camera saw are completed as trays; what is no drawer, or was seen whole, is left as it was seen."""
+"""Drawers whose rear no camera saw are completed as trays; what is no drawer, or was seen whole, is left as it was
+seen."""
 
 import numpy as np
 import pytest
@@ -64,7 +65,10 @@ def test_a_drawer_gets_its_rear(shifts):
     seen, whole = completed(TRAY, shifts=shifts)
     truth = trimesh.util.concatenate([trimesh.creation.box(bounds=b) for b in moved(TRAY, shifts[0])])
     points = truth.sample(4000, seed=0)
-    gap = [cKDTree(trimesh.Trimesh(m.vertices, m.faces, process=False).sample(8000, seed=0)).query(points)[0] for m in (seen, whole)]
+    gap = [
+        cKDTree(trimesh.Trimesh(m.vertices, m.faces, process=False).sample(8000, seed=0)).query(points)[0]
+        for m in (seen, whole)
+    ]
     assert gap[0].max() > 0.15 and gap[1].max() < 0.1
     back, end = 0.5 + shifts[0], -0.5 + shifts[0]
     assert whole.vertices[:, 0].min() == pytest.approx(back - DEPTH * (back - end), abs=2 * VOXEL)
@@ -106,7 +110,12 @@ def test_what_is_no_drawer_is_left_alone(part):
 def test_without_a_body_behind_it_nothing_is_known():
     seen, whole = completed(TRAY, body=boards(((-0.5, -0.4, -0.4), (0.5, 0.4, -0.36))))
     assert whole is seen
-    assert find_front(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((3, 3), np.uint8)), np.array([1.0, 0, 0]), VOXEL) is None
+    assert (
+        find_front(
+            Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((3, 3), np.uint8)), np.array([1.0, 0, 0]), VOXEL
+        )
+        is None
+    )
 
 
 def sheet(at, size):
@@ -116,7 +125,8 @@ def sheet(at, size):
 
 @pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
 def test_nothing_of_the_body_stands_in_the_trays_way(shifts):
-    """A sheet across the drawer's way goes out of the body, in the drawer and before it; walls, and what is beside its way, stay."""
+    """A sheet across the drawer's way goes out of the body, in the drawer and before it; walls, and what is beside its
+    way, stay."""
     _, body, tray, _ = found(TRAY, shifts=shifts)
 
     assert clear_way(body, tray, VOXEL) is body
@@ -130,7 +140,8 @@ def test_nothing_of_the_body_stands_in_the_trays_way(shifts):
 def test_a_patch_of_another_part_on_the_trays_side_goes(shifts):
     """Where it is while the drawer is open tells: on its side, not before its front, beside it or over its mouth."""
     _, _, tray, _ = found(TRAY, shifts=shifts)
-    place = np.eye(4)  # from the other part's start state, which moves to where it is while the drawer is open, to the drawer's own
+    # from the other part's start state, which moves to where it is while the drawer is open, to the drawer's own
+    place = np.eye(4)
     place[:3, 3] = [-0.2, 0, 0.3]
     for at in ((0.3, -0.32, -0.05), (0.3, 0.31, 0.0), (0.3, -0.45, -0.05), (0.3, 0.0, 0.3), (0.75, 0.0, 0.0)):
         other = sheet(np.array([at[0] + shifts[0], *at[1:]]) - place[:3, 3], (0.1, 0.001, 0.04))

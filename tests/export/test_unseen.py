@@ -62,7 +62,10 @@ def test_a_mouth_that_a_door_covers_is_not_closed():
     door = boards(((0.5, -0.4, -0.3), (0.54, 0.4, 0.3)))
     mesh, whole = closed(CRATE + door, lids=1)
     assert len(mesh.faces) < len(whole.faces)  # its underside
-    front = [t.triangles_center[:, 0] > 0.4 for t in (trimesh.Trimesh(m.vertices, m.faces, process=False) for m in (mesh, whole))]
+    front = [
+        t.triangles_center[:, 0] > 0.4
+        for t in (trimesh.Trimesh(m.vertices, m.faces, process=False) for m in (mesh, whole))
+    ]
     assert front[1].sum() < 1.5 * front[0].sum()
 
 
@@ -100,13 +103,18 @@ CUPBOARD = boards(
 
 
 def test_what_stands_on_a_plinth_is_closed_on_top_of_it():
-    seen, whole = (trimesh.Trimesh(m.vertices, m.faces, process=False) for m in closed(CUPBOARD, elevations=(0.0, 15.0, 40.0), voxel=0.012))
+    seen, whole = (
+        trimesh.Trimesh(m.vertices, m.faces, process=False)
+        for m in closed(CUPBOARD, elevations=(0.0, 15.0, 40.0), voxel=0.012)
+    )
     added = trimesh.Trimesh(whole.vertices, whole.faces[len(seen.faces) :], process=False)
     assert added.area == pytest.approx(0.8 * 0.8, rel=0.15) and (added.face_normals[:, 2] < -0.9).mean() > 0.8
     assert np.median(added.triangles_center[:, 2]) == pytest.approx(PLINTH - 0.5, abs=0.02)
 
 
-@pytest.mark.parametrize("height, back, found", [(0.12, 0.12, True), (0.05, 0.12, False), (0.12, 0.03, False), (0.4, 0.12, False)])
+@pytest.mark.parametrize(
+    "height, back, found", [(0.12, 0.12, True), (0.05, 0.12, False), (0.12, 0.03, False), (0.4, 0.12, False)]
+)
 def test_toes_fit_under_a_front_that_stands_on_a_plinth(height, back, found):
     block = boards(((-0.4, -0.4, height - 0.5), (0.4, 0.4, 0.5)), ((-0.4, -0.4, -0.5), (0.4 - back, 0.4, height - 0.5)))
     mesh = fuse(look(block, ring(12, 160, elevations=(0.0, 15.0))), [EYE] * 12, 0, 0.01, 0.04, 0.02)

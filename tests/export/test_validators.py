@@ -1,4 +1,5 @@
-"""Validators of formats pass what exports write and find what is planted; the extra names everything that --check runs."""
+"""Validators of formats pass what exports write and find what is planted; the extra names everything that --check
+runs."""
 
 import json
 import re
@@ -70,11 +71,17 @@ def test_a_validator_that_crashes_is_a_finding(tmp_path):
 def test_only_what_the_validator_cannot_know_of_splats_is_left_out(tmp_path, monkeypatch):
     """By a validator that says what a real one says; without node, too."""
     said = [
-        {"code": "MESH_PRIMITIVE_INVALID_ATTRIBUTE", "pointer": "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:SCALE"},
+        {
+            "code": "MESH_PRIMITIVE_INVALID_ATTRIBUTE",
+            "pointer": "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:SCALE",
+        },
         {"code": "MESH_PRIMITIVE_INVALID_ATTRIBUTE", "pointer": "/meshes/0/primitives/0/attributes/SCALE"},
         {"code": "ACCESSOR_MIN_MISMATCH", "pointer": "/accessors/0/min/0"},
     ]
-    out = json.dumps([m | {"message": "Wrong.", "severity": 0} for m in said] + [{"code": "UNUSED_OBJECT", "message": "", "severity": 2}])
+    out = json.dumps(
+        [m | {"message": "Wrong.", "severity": 0} for m in said]
+        + [{"code": "UNUSED_OBJECT", "message": "", "severity": 2}]
+    )
     monkeypatch.setattr(validators, "gltf_validator_path", lambda: "there")
     monkeypatch.setattr(validators.subprocess, "run", lambda words, **_: subprocess.CompletedProcess(words, 0, out, ""))
     found = VALIDATORS["gltf-validator, splats"].run(tmp_path)

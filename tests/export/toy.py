@@ -69,7 +69,9 @@ def joint_prismatic(axis, origin, length) -> Joint:
     T = torch.eye(4, dtype=torch.float64)
     T[:3, 3] = torch.tensor(axis, dtype=torch.float64) * length
     origin = torch.tensor(origin, dtype=torch.float64)
-    return Joint("prismatic", torch.tensor(axis, dtype=torch.float64), origin, length, (min(0.0, length), max(0.0, length)), T)
+    return Joint(
+        "prismatic", torch.tensor(axis, dtype=torch.float64), origin, length, (min(0.0, length), max(0.0, length)), T
+    )
 
 
 def start_parts():
@@ -98,7 +100,16 @@ def toy_twin(similarity: Similarity = NO_CHANGE, sh_degree=1, canonical_time=0.0
         T = j.transform.clone()
         T[:3, 3] = s * (j.transform[:3, 3] - c + j.transform[:3, :3] @ c)
         unit = 1.0 if j.type == "revolute" else s
-        inner.append(Joint(j.type, j.axis, similarity.to_internal(j.origin), j.motion * unit, (j.limits[0] * unit, j.limits[1] * unit), T))
+        inner.append(
+            Joint(
+                j.type,
+                j.axis,
+                similarity.to_internal(j.origin),
+                j.motion * unit,
+                (j.limits[0] * unit, j.limits[1] * unit),
+                T,
+            )
+        )
     parts = [Part(0), Part(1, inner[0], confidence=0.9), Part(2, inner[1], confidence=0.8)]
     return ArticulatedObject(g, ids, parts, canonical_time, similarity)
 
@@ -121,29 +132,41 @@ def ring(n=8, size=100, radius=2.6, elevations=(20.0, 55.0)) -> list[Camera]:
     for i in range(n):
         az, el = 2 * math.pi * (i + 0.25) / n, math.radians(elevations[i % len(elevations)])
         cams.append(
-            look_at((radius * math.cos(el) * math.cos(az), radius * math.cos(el) * math.sin(az), radius * math.sin(el)), (0, 0, 0), size)
+            look_at(
+                (radius * math.cos(el) * math.cos(az), radius * math.cos(el) * math.sin(az), radius * math.sin(el)),
+                (0, 0, 0),
+                size,
+            )
         )
     return cams
 
 
 def toy_scene(similarity: Similarity = NO_CHANGE, n=8, size=100, render=None) -> TwoStateScene:
-    """Views around the cabinet in internal coordinates; ``render(state, camera) -> ([H, W, 3], [H, W])`` in 0..1 fills the images."""
+    """Views around the cabinet in internal coordinates; ``render(state, camera) -> ([H, W, 3], [H, W])`` in 0..1 fills
+    the images."""
     views = []
     for state in (0, 1):
         for split, count, turn in (("train", n, 0.0), ("test", 2, 0.4)):
             for i, cam in enumerate(ring(count, size)):
                 viewmat = cam.viewmat.double()
                 a = torch.tensor(
-                    [[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]], dtype=torch.float64
+                    [[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]],
+                    dtype=torch.float64,
                 )
                 viewmat[:3, :3] = viewmat[:3, :3] @ a
                 R, t = viewmat[:3, :3], viewmat[:3, 3]
                 viewmat[:3, 3] = similarity.scale * (t + R @ torch.tensor(similarity.center, dtype=torch.float64))
                 cam = Camera(viewmat.float(), cam.K, size, size)
                 if render is None:
-                    image, alpha = torch.zeros(size, size, 3, dtype=torch.uint8), torch.zeros(size, size, dtype=torch.uint8)
+                    image, alpha = (
+                        torch.zeros(size, size, 3, dtype=torch.uint8),
+                        torch.zeros(size, size, dtype=torch.uint8),
+                    )
                 else:
                     rgb, a = render(state, cam)
-                    image, alpha = (rgb.clamp(0, 1) * 255).round().to(torch.uint8), (a.clamp(0, 1) * 255).round().to(torch.uint8)
+                    image, alpha = (
+                        (rgb.clamp(0, 1) * 255).round().to(torch.uint8),
+                        (a.clamp(0, 1) * 255).round().to(torch.uint8),
+                    )
                 views.append(View(f"{state}/{split}/{i:04d}", state, split, cam, image, alpha))
     return TwoStateScene("toy", tuple(views), similarity)

@@ -101,7 +101,9 @@ def desk(tmp_path_factory) -> Path:
     """A stranger's working directory after one bench: five files of their own, a scene, runs/bench/own."""
     folder = tmp_path_factory.mktemp("own")
     pages = {"my_phases.py": "add_phase.md", "my_callbacks.py": "add_callback.md"}  # the docs' own examples
-    texts = {name: next(b.text for b in blocks(REPO / "docs" / page) if b.title == name) for name, page in pages.items()}
+    texts = {
+        name: next(b.text for b in blocks(REPO / "docs" / page) if b.title == name) for name, page in pages.items()
+    }
     texts |= {
         "my_losses.py": LOSS,
         "my_data.py": DATA,
@@ -132,7 +134,9 @@ def test_the_fit_used_all_five(desk, run):
     told = json.loads((run / "diagnostics.json").read_text())["losses"]
     assert told["single_state_0"]["own_grey"][0] > 0 and "own_grey" not in told["articulation"]
     lines = [json.loads(line) for line in (run / "joints.jsonl").read_text().splitlines()]
-    assert [(line["phase"], line["step"]) for line in lines] == [("colours", s) for s in (2, 4, 6)] + [("articulation", s) for s in (3, 6)]
+    assert [(line["phase"], line["step"]) for line in lines] == [("colours", s) for s in (2, 4, 6)] + [
+        ("articulation", s) for s in (3, 6)
+    ]
     assert (run / "metrics.json").is_file() and (run / "meshes" / "end" / "whole.ply").is_file()
     drew = (desk / "drawn.txt").read_text().split()
     assert {"fit", "export", "test"} <= set(drew)
@@ -143,7 +147,9 @@ def test_the_phase_changed_colours_alone(run):
 
     before, after = (handover.load(run / "checkpoints" / f"{n}.pt")[0] for n in ("canonical_fusion", "colours"))
     assert not torch.equal(before.gaussians.sh[:, 0], after.gaussians.sh[:, 0])
-    assert all(torch.equal(getattr(before.gaussians, n), getattr(after.gaussians, n)) for n in ("means", "quats", "log_scales"))
+    assert all(
+        torch.equal(getattr(before.gaussians, n), getattr(after.gaussians, n)) for n in ("means", "quats", "log_scales")
+    )
     learned = handover.load(run / "checkpoints" / "articulation.pt")[0]
     assert len(learned.gaussians) == len(after.gaussians)
 
@@ -155,7 +161,9 @@ def test_predict_knows_the_plugins(desk, run):
     assert list((desk / "states").glob("*.png")) and (desk / "drawn.txt").read_text().split() == ["predict"]
 
 
-@pytest.mark.parametrize("words", [["predict"], ["export", "--format", "urdf"], ["view"], ["test"]], ids=lambda words: words[0])
+@pytest.mark.parametrize(
+    "words", [["predict"], ["export", "--format", "urdf"], ["view"], ["test"]], ids=lambda words: words[0]
+)
 def test_a_plugin_out_of_reach_is_told_in_one_sentence(run, tmp_path, words, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main([words[0], str(run), *words[1:]]) == 2
@@ -172,5 +180,7 @@ def test_an_edit_of_ones_own_phase_makes_it_again_and_nothing_before_it(desk, ru
         done = p2gs(desk, "fit", *words)
     finally:
         file.write_text(text)
-    assert done.returncode == 2 and "colours: runs again: the code of my_phases changed" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 2 and "colours: runs again: the code of my_phases changed" in done.stdout, (
+        done.stdout + done.stderr
+    )
     assert done.stdout.count("done before, unchanged") == 7, done.stdout

@@ -1,4 +1,5 @@
-"""A small fit in processes of its own that tests may kill, starve and send signals to, and what its folder has to hold in the end."""
+"""A small fit in processes of its own that tests may kill, starve and send signals to, and what its folder has to hold
+in the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A fit that is killed, starved of disk, locked out or told to stop ends in the same bytes when it is started again. ``make faults``."""
+"""A fit that is killed, starved of disk, locked out or told to stop ends in the same bytes when it is started again.
+``make faults``."""
 
 import os
 import random
@@ -85,7 +86,12 @@ def test_a_full_disk_is_told_and_the_run_goes_on(whole, tmp_path, limit_kb):
     run = tmp_path / "run"
     limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limit_kb << 10, limit_kb << 10))
     ended = fit(whole.config, run, preexec_fn=limit)
-    assert ended.code in (1, 2) and "Traceback" not in ended.said and "error: " in ended.said and "File too large" in ended.said, ended.said
+    assert (
+        ended.code in (1, 2)
+        and "Traceback" not in ended.said
+        and "error: " in ended.said
+        and "File too large" in ended.said
+    ), ended.said
     whole.same(run, fit(whole.config, run))
 
 
@@ -97,7 +103,9 @@ def small_disk(tmp_path):
     def mount(kb):
         folder = tmp_path / "disk"
         folder.mkdir()
-        done = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={kb}k", "p2gs-faults", str(folder)], capture_output=True, text=True)
+        done = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={kb}k", "p2gs-faults", str(folder)], capture_output=True, text=True
+        )
         if done.returncode:
             pytest.skip(f"no tmpfs can be mounted: {done.stderr.strip()}")
         made.append(folder)
@@ -112,7 +120,9 @@ def small_disk(tmp_path):
 def test_a_small_disk_is_told_and_the_run_goes_on_when_it_has_grown(whole, small_disk, kb):
     disk = small_disk(kb)
     ended = fit(whole.config, disk / "run")
-    assert ended.code in (1, 2) and "Traceback" not in ended.said and "No space left on device" in ended.said, ended.said
+    assert ended.code in (1, 2) and "Traceback" not in ended.said and "No space left on device" in ended.said, (
+        ended.said
+    )
     subprocess.run(["mount", "-o", "remount,size=200m", str(disk)], check=True)
     whole.same(disk / "run", fit(whole.config, disk / "run"))
 

@@ -1,4 +1,5 @@
-"""Damage to files: to their bytes, to the values inside JSON and YAML, to what a PNG or PLY header claims, to the file itself.
+"""Damage to files: to their bytes, to the values inside JSON and YAML, to what a PNG or PLY header claims, to the file
+itself.
 
 Every function takes a ``random.Random`` and is a pure function of it and its input.
 """
@@ -14,7 +15,23 @@ import zlib
 from pathlib import Path
 from typing import Any, Callable
 
-ODD_NUMBERS = (0, -1, 1, 0.5, 1e-320, 1e38, -1e39, 1e308, 2**31, 2**63, 10**30, 10**400, float("nan"), float("inf"), -float("inf"))
+ODD_NUMBERS = (
+    0,
+    -1,
+    1,
+    0.5,
+    1e-320,
+    1e38,
+    -1e39,
+    1e308,
+    2**31,
+    2**63,
+    10**30,
+    10**400,
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+)
 ODD_TEXTS = (
     "", " ", ".", "..", "/", "x", "null", "nan", "1e999", "../../../../etc/hostname", "/etc/hostname", "~/x", "a" * 300,
     "a/" * 3000, "b" * 50_000, "\0", "a\0b", "\ud800", "\u202e", "<script>alert(1)</script>", "%s%n", "{}", "C:\\x", "-1",
@@ -64,7 +81,8 @@ def _places(tree: Any, found: list, parent=None, key=None, limit: int = 5000) ->
 
 
 def mutate_tree(tree: Any, rng: random.Random) -> Any:
-    """One to three changes: a value replaced, removed, renamed, doubled, wrapped, made text, or two exchanged. The tree is changed."""
+    """One to three changes: a value replaced, removed, renamed, doubled, wrapped, made text, or two exchanged. The tree
+    is changed."""
     for _ in range(rng.choice((1, 1, 2, 3))):
         places = _places(tree, [])
         if not places or rng.random() < 0.03:
@@ -91,7 +109,8 @@ def mutate_tree(tree: Any, rng: random.Random) -> Any:
 
 
 def mutate_bytes(data: bytes, rng: random.Random) -> bytes:
-    """Bits flipped, a stretch cut, doubled, zeroed or made noise, or the end cut off. Never the same bytes (but for empty ones)."""
+    """Bits flipped, a stretch cut, doubled, zeroed or made noise, or the end cut off. Never the same bytes (but for
+    empty ones)."""
     out = bytearray(data)
     if not out:
         return b"\0"
@@ -118,7 +137,9 @@ def mutate_json(data: bytes, rng: random.Random) -> bytes:
     if rng.random() < 0.15:
         return mutate_bytes(data, rng)
     if rng.random() < 0.03:
-        return rng.choice((b"[" * 200_000, b'{"frames": ' * 20_000, b"9" * 100_000, b"\xff\xfe", b"NaN", b"null", b"{}"))
+        return rng.choice(
+            (b"[" * 200_000, b'{"frames": ' * 20_000, b"9" * 100_000, b"\xff\xfe", b"NaN", b"null", b"{}")
+        )
     return json.dumps(mutate_tree(json.loads(data), rng)).encode()
 
 

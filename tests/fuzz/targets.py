@@ -1,6 +1,7 @@
 """What is fuzzed: a folder of sound files made once, and a function that reads them.
 
-Reading a damaged folder may succeed or raise UserError; anything else is a fault. What two readers say of one folder must agree.
+Reading a damaged folder may succeed or raise UserError; anything else is a fault. What two readers say of one folder
+must agree.
 """
 
 from __future__ import annotations
@@ -106,7 +107,12 @@ def _read_run(folder: Path) -> None:
     from p2gs.surface.mesh import read_mesh
     from p2gs.surface.protocol import surface_options
 
-    for read, path in ((load_twin, folder), (read_cameras, folder / "cameras.json"), (run_rasterizer, folder), (surface_options, folder)):
+    for read, path in (
+        (load_twin, folder),
+        (read_cameras, folder / "cameras.json"),
+        (run_rasterizer, folder),
+        (surface_options, folder),
+    ):
         try:
             made = read(path)
         except UserError:

@@ -1,4 +1,5 @@
-"""Damaged scenes, configs, twins, splats and checkpoints: read, or refused in a sentence; no traceback, no hang, no more than 2 GB."""
+"""Damaged scenes, configs, twins, splats and checkpoints: read, or refused in a sentence; no traceback, no hang, no
+more than 2 GB."""
 
 import json
 import subprocess
@@ -15,7 +16,9 @@ def fuzz(folder: Path, seed: int, count: int, timeout: float) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, cwd=WORKER.parents[2])
     assert done.returncode == 0, done.stderr[-2000:]
     *faults, totals = map(json.loads, done.stdout.splitlines())
-    told = "\n\n".join(f"mutant {f['number']} of seed {seed}, {f['target']}, {f['damage']}\n{f['fault']}" for f in faults[:10])
+    told = "\n\n".join(
+        f"mutant {f['number']} of seed {seed}, {f['target']}, {f['damage']}\n{f['fault']}" for f in faults[:10]
+    )
     assert not faults, f"{len(faults)} of {count} mutants:\n{told}"
     assert totals["mutants"] == count and totals["grown_mib"] < 2048, totals
 

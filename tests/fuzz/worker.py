@@ -1,6 +1,8 @@
-"""Fuzz in a process of its own, with little memory: ``python tests/fuzz/worker.py FOLDER --seed 0 --count 200 [--only N]``.
+"""Fuzz in a process of its own, with little memory: ``python tests/fuzz/worker.py FOLDER --seed 0 --count 200 [--only
+N]``.
 
-Prints one JSON line a fault and one with the totals. A mutant is a function of seed and number alone: ``--only N`` does that one again.
+Prints one JSON line a fault and one with the totals. A mutant is a function of seed and number alone: ``--only N`` does
+that one again.
 """
 
 from __future__ import annotations
@@ -98,7 +100,16 @@ def main() -> None:
             faults += 1
             print(json.dumps({"number": number, "target": name, "damage": done, "fault": fault}), flush=True)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak) >> 10
-    print(json.dumps({"mutants": args.count, "faults": faults, "grown_mib": grown, "seconds": round(time.process_time() - began, 1)}))
+    print(
+        json.dumps(
+            {
+                "mutants": args.count,
+                "faults": faults,
+                "grown_mib": grown,
+                "seconds": round(time.process_time() - began, 1),
+            }
+        )
+    )
 
 
 if __name__ == "__main__":

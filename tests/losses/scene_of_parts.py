@@ -1,4 +1,5 @@
-"""A small articulated cloud for the tests of the part losses: a base, a door that turns, a drawer that slides; float64."""
+"""A small articulated cloud for the tests of the part losses: a base, a door that turns, a drawer that slides;
+float64."""
 
 from dataclasses import replace
 
@@ -73,7 +74,13 @@ def permuted(inputs, order):
     """The same scene with its Gaussians in another order."""
     p = inputs.parts
     place = order.argsort()
-    return with_parts(inputs, probs=p.probs[order], means_canonical=p.means_canonical[order], pairs=place[p.pairs], knn=place[p.knn[order]])
+    return with_parts(
+        inputs,
+        probs=p.probs[order],
+        means_canonical=p.means_canonical[order],
+        pairs=place[p.pairs],
+        knn=place[p.knn[order]],
+    )
 
 
 def doubled(inputs):

@@ -42,6 +42,8 @@ def build(name, **options):
     return cls(**{"weight": 1.0, **options})
 
 
+#
+#
 # -- the formulas as loops ----------------------------------------------------------------------------------------------------
 def kl(p, q):
     return sum(a * math.log(a / b) for a, b in zip(p, q, strict=True))
@@ -85,7 +87,8 @@ def velocity_naive(p, variant):
     for k, T in enumerate(p.transforms.tolist()):
         weights = [p.probs[i, k].item() for i in p.pairs.tolist()]
         moves = [
-            minus(m1, m0) if variant == "paper" else minus(move(T, m0), m1) for m0, m1 in zip(p.mu0.tolist(), p.mu1.tolist(), strict=True)
+            minus(m1, m0) if variant == "paper" else minus(move(T, m0), m1)
+            for m0, m1 in zip(p.mu0.tolist(), p.mu1.tolist(), strict=True)
         ]
         mass = sum(weights)
         mean = [sum(w * m[c] for w, m in zip(weights, moves, strict=True)) / mass for c in range(3)]
@@ -94,7 +97,8 @@ def velocity_naive(p, variant):
 
 
 def force_naive(x, p, tau, radius=None, k_r=5e-4, eps=1e-5, strength=0.005):
-    """With a radius every point within it exerts ``strength`` tau_max (radius / d)^2, tau_max 0.01 of the extent; else the paper's sum."""
+    """With a radius every point within it exerts ``strength`` tau_max (radius / d)^2, tau_max 0.01 of the extent; else
+    the paper's sum."""
     total = [0.0] * 3
     for r in p.repel_points.tolist():
         offset = minus(r, x)
@@ -128,7 +132,9 @@ def art_paper_naive(p, tau, lambda_rot=0.1):
         x = [sum(w * c[d] for w, c in zip(q, xs, strict=True)) for d in range(3)]
         F = force_naive(x, p, tau)
         total += norm([a + (1 - q[0]) * f - b for a, f, b in zip(x, F, m1, strict=True)]) ** 2
-    return total + lambda_rot * sum(angle_naive(T[:3, :3], R) for T, R in zip(p.transforms[1:], p.target_rotation[1:], strict=True))
+    return total + lambda_rot * sum(
+        angle_naive(T[:3, :3], R) for T, R in zip(p.transforms[1:], p.target_rotation[1:], strict=True)
+    )
 
 
 def contact_naive(p, time, margin):
@@ -174,6 +180,8 @@ def test_losses_are_their_formulas(seed):
         assert loss(inputs).item() == pytest.approx(value, rel=1e-9), loss
 
 
+#
+#
 # -- invariances --------------------------------------------------------------------------------------------------------------
 @each_loss
 def test_the_world_frame_does_not_matter(name, options):
@@ -201,6 +209,8 @@ def test_the_sum_grows_with_the_number(name):
     torch.testing.assert_close(loss(doubled(inputs)), 2 * loss(inputs))
 
 
+#
+#
 # -- gradients ----------------------------------------------------------------------------------------------------------------
 @each_loss
 def test_gradients_against_finite_differences(name, options):
@@ -251,6 +261,8 @@ def test_gradients_stay_finite_when_everything_is_certain_and_coincides(name, op
         assert g is None or torch.isfinite(g).all()
 
 
+#
+#
 # -- what the terms are for ---------------------------------------------------------------------------------------------------
 def test_a_true_rigid_motion_costs_nothing_but_the_paper_velocity_charges_for_turning():
     inputs = make_inputs(seed=8, sharp=True, noise=0.0)
@@ -269,8 +281,11 @@ def test_agreement_with_neighbours_costs_nothing():
 
 
 def test_the_optimum_of_the_articulation_loss_lies_away_from_repel_points():
-    """A plate whose target is 0.02 from a wall: with the paper's sign it settles further away, by tau_max; reversed, nearer."""
-    y, z = torch.meshgrid(torch.linspace(-0.5, 0.5, 9, dtype=F64), torch.linspace(-0.5, 0.5, 9, dtype=F64), indexing="ij")
+    """A plate whose target is 0.02 from a wall: with the paper's sign it settles further away, by tau_max; reversed,
+    nearer."""
+    y, z = torch.meshgrid(
+        torch.linspace(-0.5, 0.5, 9, dtype=F64), torch.linspace(-0.5, 0.5, 9, dtype=F64), indexing="ij"
+    )
     plate = torch.stack([torch.zeros_like(y), y, z], -1).reshape(-1, 3)
     wall = plate - torch.tensor([0.02, 0.0, 0.0], dtype=F64)
     inputs = make_inputs(n=81, total=10**6)
@@ -303,9 +318,12 @@ def test_the_optimum_of_the_articulation_loss_lies_away_from_repel_points():
 
 @pytest.mark.parametrize("exponent", [2.0, 3.0, 4.0])
 def test_exponent_and_count_of_repel_points_act_below_the_clip(exponent):
-    """A part 0.05 from a wall with 20 points in reach: half to twice as many points are half to twice the force; p changes it, too."""
+    """A part 0.05 from a wall with 20 points in reach: half to twice as many points are half to twice the force; p
+    changes it, too."""
     inputs = make_inputs(n=40)
-    wall = 0.04 * torch.randn(40, 3, generator=torch.Generator().manual_seed(1), dtype=F64) + torch.tensor([0.05, 0.0, 0.0], dtype=F64)
+    wall = 0.04 * torch.randn(40, 3, generator=torch.Generator().manual_seed(1), dtype=F64) + torch.tensor(
+        [0.05, 0.0, 0.0], dtype=F64
+    )
     x = torch.zeros(1, 3, dtype=F64)
     extent = inputs.parts.extent
     loss = build("art", exponent=exponent, radius=0.1 / extent)
@@ -365,6 +383,8 @@ def test_contact_by_the_letter_punishes_containment_and_the_margin_does_not():
     assert build("contact")(touching).item() > 1e-3
 
 
+#
+#
 # -- switches -----------------------------------------------------------------------------------------------------------------
 @each_loss
 def test_missing_inputs_give_none(name, options):

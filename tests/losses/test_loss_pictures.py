@@ -20,7 +20,13 @@ def make_inputs(h=14, w=17, dtype=F64, depth=True):
     alpha, z = draw(h, w), 1 + draw(h, w)
     render = RenderOutput(draw(h, w, 3), alpha, alpha * z, alpha * draw(h, w) + alpha * (z - 1.5) ** 2, depth_ref=1.5)
     known = draw(h, w) * 2 * (draw(h, w) > 0.3)
-    target = Target(draw(h, w, 3), (draw(h, w) > 0.4).to(dtype), torch.ones(3, dtype=dtype), known if depth else None, key=("view", 1))
+    target = Target(
+        draw(h, w, 3),
+        (draw(h, w) > 0.4).to(dtype),
+        torch.ones(3, dtype=dtype),
+        known if depth else None,
+        key=("view", 1),
+    )
     logits = draw(30) * 6 - 3
     gaussians = GaussianTensors(draw(30, 3), draw(30, 4), draw(30, 3), logits, draw(30, 1, 3))
     return LossInputs(0, 100, gaussians, render, target)
@@ -42,7 +48,13 @@ def test_render_is_l1_and_structural_similarity():
     # skimage mirrors at the border where the loss pads with zeros: give it the zeros
     padded = [torch.nn.functional.pad(image, (0, 0, 10, 10, 10, 10)).numpy() for image in (a, b)]
     _, similarity = structural_similarity(
-        *padded, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, full=True
+        *padded,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        full=True,
     )
     whole = LOSSES["render"](ssim_lambda=1.0)(inputs).item()
     assert whole == pytest.approx(1 - similarity[10:-10, 10:-10].mean(), abs=1e-6)
@@ -69,7 +81,9 @@ def test_alpha_is_cross_entropy_and_its_gradient_is_bounded():
     assert LOSSES["alpha"](weight=1.0)(inputs).item() == pytest.approx(value / inputs.render.alpha.numel(), rel=1e-3)
     alpha = torch.tensor([[0.0, 1.0, 0.0, 1.0]], requires_grad=True)
     hard = replace(
-        inputs, render=replace(inputs.render, alpha=alpha), target=replace(inputs.target, alpha=torch.tensor([[0.0, 1.0, 1.0, 0.0]]))
+        inputs,
+        render=replace(inputs.render, alpha=alpha),
+        target=replace(inputs.target, alpha=torch.tensor([[0.0, 1.0, 1.0, 0.0]])),
     )
     LOSSES["alpha"]()(hard).backward()
     assert torch.isfinite(alpha.grad).all()
@@ -84,7 +98,9 @@ def test_opacity_pushes_away_from_one_half():
     LOSSES["opacity"]()(replace(inputs, gaussians=replace(inputs.gaussians, opacity_logits=logits))).backward()
     assert logits.grad[0] > 0 > logits.grad[1]
     order = torch.randperm(30)
-    torch.testing.assert_close(LOSSES["opacity"]()(replace(inputs, gaussians=inputs.gaussians[order])), LOSSES["opacity"]()(inputs))
+    torch.testing.assert_close(
+        LOSSES["opacity"]()(replace(inputs, gaussians=inputs.gaussians[order])), LOSSES["opacity"]()(inputs)
+    )
 
 
 def test_flat_shrinks_the_shortest_axis_alone():
@@ -115,7 +131,9 @@ def test_depth_variance_is_twice_its_mean_over_the_foreground():
         if t.alpha[y, x] > 0.5:
             A, first, second = r.alpha[y, x], r.depth[y, x] - 1.5 * r.alpha[y, x], r.depth_sq[y, x]
             terms.append((A * second - first * first).item())
-    assert LOSSES["depth_variance"](weight=1.0, end_weight=None)(inputs).item() == pytest.approx(2 * sum(terms) / len(terms))
+    assert LOSSES["depth_variance"](weight=1.0, end_weight=None)(inputs).item() == pytest.approx(
+        2 * sum(terms) / len(terms)
+    )
     default = LOSSES["depth_variance"]()
     assert default.weight_at(0, 100) == 30
     assert default.weight_at(50, 100) == pytest.approx(math.sqrt(300))
@@ -193,7 +211,9 @@ def test_planar_against_its_slow_twin():
                     line = [(y + i * dy, x + i * dx) for i in range(2 * s + 1)]
                     if not all(inside[p] for p in line):
                         continue
-                    steps = [(t.image[a] - t.image[b]).abs().mean().item() for a, b in zip(line, line[1:], strict=False)]
+                    steps = [
+                        (t.image[a] - t.image[b]).abs().mean().item() for a, b in zip(line, line[1:], strict=False)
+                    ]
                     tv = sum(max(step - loss.noise, 0) for step in steps)
                     z = [depth[line[i]].item() for i in (0, s, 2 * s)]
                     w = math.exp(-tv / loss.contrast)

@@ -106,7 +106,9 @@ def test_a_part_of_few_triangles_is_part_of_the_whole_and_crumbs_are_not():
     base, door = box((2, 2, 2)).subdivide().subdivide(), box((0.5, 1, 1), (3, 0, 0))
     assert len(door.faces) < 0.1 * len(base.faces)
     crumb = box((0.1, 0.1, 0.1), (5, 0, 0))
-    crumbs = Mesh(np.concatenate([base.vertices, crumb.vertices]), np.concatenate([base.faces, crumb.faces + len(base.vertices)]))
+    crumbs = Mesh(
+        np.concatenate([base.vertices, crumb.vertices]), np.concatenate([base.faces, crumb.faces + len(base.vertices)])
+    )
     gt, pred = states(base, [door]), states(crumbs, [door])
     report = C.evaluate_chamfer(pred, gt, {0: 0}, seeds=(0,))
     assert report.whole == pytest.approx(report.floors["whole"], rel=0.1)
@@ -146,4 +148,5 @@ def test_ground_truth_of_a_real_object_scores_its_floor(scenes):
     report = C.evaluate_chamfer(backwards, gt, assignment, seeds=(0,), clean=0.0)
     for name in ("static", "movable", "whole"):
         assert report.to_dict()[name]["value"] == pytest.approx(report.floors[name], rel=0.02)
-    assert report.floors["whole"] < C.sampling_floor(C.surface_area(gt["start"].whole))  # thin walls, modelled from both sides
+    # thin walls, modelled from both sides
+    assert report.floors["whole"] < C.sampling_floor(C.surface_area(gt["start"].whole))

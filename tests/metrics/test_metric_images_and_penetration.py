@@ -43,7 +43,9 @@ def test_image_scores_agree_with_skimage():
 def gaussians(means, scale=0.05, opacity=6.0):
     n = len(means)
     quats = torch.randn(n, 4, generator=torch.Generator().manual_seed(1))
-    return GaussianTensors(means, quats, torch.full((n, 3), scale).log(), torch.full((n,), opacity), torch.zeros(n, 1, 3))
+    return GaussianTensors(
+        means, quats, torch.full((n, 3), scale).log(), torch.full((n,), opacity), torch.zeros(n, 1, 3)
+    )
 
 
 def occupancy_naive(static, points):
@@ -54,7 +56,9 @@ def occupancy_naive(static, points):
         for i in range(len(static)):
             local = R[i].T @ (x - static.means[i].double()) / static.log_scales[i].double().exp()
             if local @ local < 9:
-                clear *= 1 - torch.sigmoid(static.opacity_logits[i].double()).item() * torch.exp(-0.5 * local @ local).item()
+                clear *= (
+                    1 - torch.sigmoid(static.opacity_logits[i].double()).item() * torch.exp(-0.5 * local @ local).item()
+                )
         out.append(1 - clear)
     return torch.tensor(out, dtype=torch.float64)
 
@@ -126,10 +130,24 @@ def test_view_scores_and_their_metric():
     photo = colour.float() / 255 * mask[..., None]
 
     def render(shift=0.0, deeper=0.0):
-        return RenderOutput((photo + shift * mask[..., None]), mask, (depth + deeper) * mask, None, 0.0, None, None, torch.zeros(1), None)
+        return RenderOutput(
+            (photo + shift * mask[..., None]),
+            mask,
+            (depth + deeper) * mask,
+            None,
+            0.0,
+            None,
+            None,
+            torch.zeros(1),
+            None,
+        )
 
     exact = evaluate_view(render(), view, diagonal=3.0)
-    assert exact["psnr_white"] == exact["psnr_black"] == float("inf") and exact["alpha_error"] == 0 and exact["depth_bad"] == 0
+    assert (
+        exact["psnr_white"] == exact["psnr_black"] == float("inf")
+        and exact["alpha_error"] == 0
+        and exact["depth_bad"] == 0
+    )
     assert exact["ssim_white"] == pytest.approx(1, abs=1e-6)
     off = evaluate_view(render(deeper=0.05), view, diagonal=3.0)
     assert off["depth_median"] == pytest.approx(0.05, abs=1e-5) and off["depth_bad"] == 1
@@ -146,7 +164,9 @@ def test_view_scores_and_their_metric():
     without_depth = View("w", 0, "test", view.camera, colour, alpha)
     metric.update(render(shift=-0.01), without_depth, 3.0)
     means = metric.means()
-    assert means["depth_median"] == pytest.approx(0.03, abs=1e-5) and means["psnr_black"] == pytest.approx(darker["psnr_black"])
+    assert means["depth_median"] == pytest.approx(0.03, abs=1e-5) and means["psnr_black"] == pytest.approx(
+        darker["psnr_black"]
+    )
     assert "depth_median" not in metric.report and "lpips" not in means and metric.psnr_white_count == 3
     metric.reset()
     assert metric.report is None and metric.psnr_white_count == 0

@@ -78,8 +78,12 @@ def test_flipping_axis_and_motion_together_changes_nothing():
 
 
 def test_position_is_scaled_by_ten_and_absent_for_prismatic():
-    assert J.joint_errors(joint("revolute", [0, 0, 1], [0.02, 0, 9]), joint("revolute", [0, 0, 1])).axis_position == pytest.approx(0.2)
-    assert J.joint_errors(joint("prismatic", [0, 0, 1], [0.02, 0, 9]), joint("prismatic", [0, 0, 1])).axis_position is None
+    assert J.joint_errors(
+        joint("revolute", [0, 0, 1], [0.02, 0, 9]), joint("revolute", [0, 0, 1])
+    ).axis_position == pytest.approx(0.2)
+    assert (
+        J.joint_errors(joint("prismatic", [0, 0, 1], [0.02, 0, 9]), joint("prismatic", [0, 0, 1])).axis_position is None
+    )
 
 
 def best_permutation_cost(pred, gt):

@@ -10,7 +10,8 @@ from p2gs.metrics import lpips as module
 from p2gs.metrics.lpips import VARIABLE, WEIGHTS, lpips, weights_file, why_absent
 from p2gs.types import UserError
 
-SHAPES = {"0": (64, 3, 11), "3": (192, 64, 5), "6": (384, 192, 3), "8": (256, 384, 3), "10": (256, 256, 3)}  # AlexNet's convolutions
+# AlexNet's convolutions
+SHAPES = {"0": (64, 3, 11), "3": (192, 64, 5), "6": (384, 192, 3), "8": (256, 384, 3), "10": (256, 256, 3)}
 
 
 @pytest.fixture
@@ -34,7 +35,8 @@ def no_cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def torchvision(monkeypatch):
-    """What torchmetrics takes from torchvision: the layers of its AlexNet, where torchvision itself is not installed (extra lpips)."""
+    """What torchmetrics takes from torchvision: the layers of its AlexNet, where torchvision itself is not installed
+    (extra lpips)."""
     if importlib.util.find_spec("torchvision") is not None:
         return
     from torch import nn

@@ -33,7 +33,9 @@ def asked(start: GaussianTensors, labels, end: GaussianTensors, end_labels, end_
     """What becomes of the start's splats that slide by ``way`` along x."""
     T = torch.eye(4, dtype=torch.float64)[None].clone()
     T[0, 0, 3] = way
-    motions = PartMotions(["prismatic"], T, torch.ones(1), [labels, end_labels], [torch.ones(len(labels)), torch.ones(len(end_labels))])
+    motions = PartMotions(
+        ["prismatic"], T, torch.ones(1), [labels, end_labels], [torch.ones(len(labels)), torch.ones(len(end_labels))]
+    )
     states = [StateGaussians(0, start), StateGaussians(1, end)]
     return kept_and_shown(states, motions, 0, [facing(0.0), end_stack], CONFIG)
 

@@ -21,7 +21,8 @@ def coloured(points):
 
 
 def down(boards, n=30_000, noise=0.05, seed=0):
-    """Rays from a lid (z = 0.4) down into a box, with the colours of the highest of ``boards`` (z, x from, x to) below, or of the box."""
+    """Rays from a lid (z = 0.4) down into a box, with the colours of the highest of ``boards`` (z, x from, x to) below,
+    or of the box."""
     g = torch.Generator().manual_seed(seed)
     start = torch.rand(n, 3, generator=g).double() * 0.8 - 0.4
     start[:, 2] = 0.4
@@ -62,7 +63,10 @@ def test_an_empty_box_has_none():
 
 def test_where_the_lid_itself_agrees_nothing_behind_it_counts():
     rays, _ = down([])
-    rays = replace(rays, colour=coloured(rays.start) + 0.01 * torch.randn(len(rays.far), 3, generator=torch.Generator().manual_seed(3)))
+    rays = replace(
+        rays,
+        colour=coloured(rays.start) + 0.01 * torch.randn(len(rays.far), 3, generator=torch.Generator().manual_seed(3)),
+    )
     assert find_boards(rays, LO, HI, 0.04, True) == []
     assert find_boards(rays, LO, HI, 0.04, False)  # better than at the walls all the same
 
@@ -82,8 +86,16 @@ def test_a_board_is_met_within_its_mask_before_the_rays_end():
     mask = torch.zeros(4, 4, dtype=torch.bool)
     mask[1, 2] = True  # y from 0.03 to 0.06, z from 0.06 to 0.09
     board = Board(0, 1.0, torch.zeros(2).double(), mask)
-    start = torch.tensor([[0.0, 0.04, 0.07], [0.0, 0.01, 0.07], [0.99, 0.04, 0.07], [0.0, 0.04, 0.07], [2.0, 0.04, 0.07]]).double()
-    rays = Rays(start, torch.eye(3).double()[[0] * 5], torch.tensor([5.0, 5, 5, 0.5, 5]).double(), torch.zeros(5, 3), torch.zeros(5).long())
+    start = torch.tensor(
+        [[0.0, 0.04, 0.07], [0.0, 0.01, 0.07], [0.99, 0.04, 0.07], [0.0, 0.04, 0.07], [2.0, 0.04, 0.07]]
+    ).double()
+    rays = Rays(
+        start,
+        torch.eye(3).double()[[0] * 5],
+        torch.tensor([5.0, 5, 5, 0.5, 5]).double(),
+        torch.zeros(5, 3),
+        torch.zeros(5).long(),
+    )
     assert board.meet(rays, 0.04).tolist() == [1.0, math.inf, math.inf, math.inf, math.inf]
     along = replace(rays, way=torch.eye(3).double()[[1] * 5])  # in the plane's direction
     assert board.meet(along, 0.04).isinf().all()
@@ -102,7 +114,10 @@ def test_a_backdrop_has_the_shelf_that_only_the_photographs_know(monkeypatch):
     def on_shelf(config):
         state = OneState(g, lids, torch.zeros(len(g), dtype=torch.int64), views[1], config, "auto", "cpu")
         points = [b.points for b in state.backdrops(walls, stacks)]
-        return [int((((p - torch.tensor([0.0, -0.05, -0.04])).abs() < torch.tensor([0.3, 0.15, 0.02])).all(1)).sum()) for p in points]
+        return [
+            int((((p - torch.tensor([0.0, -0.05, -0.04])).abs() < torch.tensor([0.3, 0.15, 0.02])).all(1)).sum())
+            for p in points
+        ]
 
     assert on_shelf(OpeningsConfig(boards=False)) == [0]
     without, *found = on_shelf(OpeningsConfig())

@@ -76,7 +76,13 @@ def test_crumbs_are_no_bodies():
 
 def state(number: int, means: torch.Tensor) -> StateGaussians:
     n = len(means)
-    g = GaussianTensors(means, torch.tensor([1.0, 0, 0, 0]).repeat(n, 1), torch.full((n, 3), -4.0), torch.full((n,), 4.0), torch.zeros(n, 1, 3))
+    g = GaussianTensors(
+        means,
+        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        torch.full((n, 3), -4.0),
+        torch.full((n,), 4.0),
+        torch.zeros(n, 1, 3),
+    )
     return StateGaussians(number, g)
 
 

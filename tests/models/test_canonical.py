@@ -7,9 +7,9 @@ import torch
 from tiny import random_gaussians
 
 from p2gs.gaussians.handover import PartMotions
-from p2gs.models import canonical
-from p2gs.models.canonical import CanonicalConfig, beta_weight, blend, carry, farthest_points, fuse, hungarian_pairs, motion_richness
-from p2gs.motion.matching import motion_clusters
+from p2gs.gaussians.pose import carry, with_static
+from p2gs.models.canonical import CanonicalConfig, blend, fuse
+from p2gs.motion.matching import beta_weight, farthest_points, hungarian_pairs, motion_clusters, motion_richness
 from p2gs.ops import se3
 from p2gs.types import GaussianTensors, UserError
 
@@ -84,7 +84,7 @@ def door_and_wall(angle=0.9, n=400):
 def test_fused_gaussians_meet_both_states_along_the_screw(beta, fusion):
     g0, g1, motions = door_and_wall()
     fused = fuse(g0, g1, motions, CanonicalConfig(beta=beta, fusion=fusion, match_size=800))
-    T = canonical.with_static(motions.transforms)
+    T = with_static(motions.transforms)
     for state, truth in ((0, g0), (1, g1)):
         posed = carry(fused.gaussians, fused.labels, se3.screw_at(T, state - fused.canonical_times))
         distance = torch.cdist(posed.means, truth.means).amin(1)
@@ -100,8 +100,12 @@ def test_fused_gaussians_meet_both_states_along_the_screw(beta, fusion):
 def test_of_the_poorer_state_only_what_the_richer_one_hides_is_added():
     g0, g1, motions = door_and_wall()
     lone = torch.arange(len(g0)) < 20
-    shift = torch.where(lone[:, None], torch.tensor([0.0, -0.5, 0.0]), torch.zeros(3))  # twenty of each state have no counterpart
-    a, b = (GaussianTensors(g.means + shift * (1 + s), g.quats, g.log_scales, g.opacity_logits, g.sh) for s, g in enumerate((g0, g1)))
+    # twenty of each state have no counterpart
+    shift = torch.where(lone[:, None], torch.tensor([0.0, -0.5, 0.0]), torch.zeros(3))
+    a, b = (
+        GaussianTensors(g.means + shift * (1 + s), g.quats, g.log_scales, g.opacity_logits, g.sh)
+        for s, g in enumerate((g0, g1))
+    )
     plain = fuse(a, b, motions, CanonicalConfig())
     shares = torch.full((len(g0),), 0.5)
     none = fuse(a, b, motions, CanonicalConfig(), (shares, shares))

@@ -20,7 +20,8 @@ from p2gs.types import Similarity
 
 
 def small_run(found=None, polish_steps=0):
-    """A run of the two panels whose discovery says ``found`` (default: the truth); everything after it takes that over."""
+    """A run of the two panels whose discovery says ``found`` (default: the truth); everything after it takes that
+    over."""
     states, labels, views = two_states(hinge())
     T = hinge()[None] if found is None else found[None]
     n = len(labels)
@@ -38,9 +39,13 @@ def small_run(found=None, polish_steps=0):
     zero = torch.zeros(n, 3)
     gave_way = [{"unconfirmed": 11, "patches": 2, "gave_way": 1, "removed": 7, "added": 40}] * 2
     counted = {"dropped": 3, "openings": gave_way}
-    canonical = CanonicalGaussians(g, torch.ones(2).double(), labels, torch.ones(n), torch.ones(n).bool(), zero, zero, None, counted)
+    canonical = CanonicalGaussians(
+        g, torch.ones(2).double(), labels, torch.ones(n), torch.ones(n).bool(), zero, zero, None, counted
+    )
     learned = Articulation(g, torch.nn.functional.one_hot(labels, 2).float(), ["revolute"], T, torch.ones(1), 0.0)
-    config = FinishConfig(polish=PolishConfig(steps=polish_steps, levels=[64], level_starts=[0.0], min_margin=0.1), clean_neighbours=0)
+    config = FinishConfig(
+        polish=PolishConfig(steps=polish_steps, levels=[64], level_starts=[0.0], min_margin=0.1), clean_neighbours=0
+    )
     twin, notes, record = finish(learned, states, views, config, Similarity(scale=2.0), seed=0, backend="auto")
     return StageResults(states, motions, states, canonical, learned, record, notes), twin, views
 
@@ -103,7 +108,11 @@ def test_a_part_that_the_twin_does_not_have_is_missed():
         ("discovery", lambda d: [r.update(bright_static=0.3) for r in d["residuals"].values()], "left with the base"),
         ("canonical_fusion", lambda d: d["fusion"].update(matched=[300, 2]), "have a partner"),
         ("canonical_fusion", lambda d: d["fusion"].update(dropped=400), "relabelled or dropped"),
-        ("articulation", lambda d: d["articulation"].update(image_loss_start=0.01, image_loss_end=0.02), "made the images worse"),
+        (
+            "articulation",
+            lambda d: d["articulation"].update(image_loss_start=0.01, image_loss_end=0.02),
+            "made the images worse",
+        ),
     ],
 )
 def test_each_rule_speaks_for_its_stage(right, stage, change, word):
@@ -155,7 +164,9 @@ def test_without_discovery_and_without_parts(tmp_path):
     states, labels, views = two_states(hinge())
     learned = replace(stages.learned, probs=torch.tensor([[1.0, 0.0]]).expand(len(labels), 2))
     twin, notes, record = finish(learned, states, views, FinishConfig(), Similarity(), seed=0, backend="auto")
-    d = write_diagnosis(tmp_path, replace(stages, learned=learned, record=record, notes=notes), twin, views, min_margin=0.1)
+    d = write_diagnosis(
+        tmp_path, replace(stages, learned=learned, record=record, notes=notes), twin, views, min_margin=0.1
+    )
     assert d["joints"] == [] and d["finish"]["parts"] == 1
     assert any("slot 1 of 1 vanished" in v["text"] for v in d["verdict"])
 
@@ -169,6 +180,10 @@ def test_fog_is_counted():
 
 
 def test_plain_rounds_and_drops_what_json_has_not():
-    assert plain({"a": float("nan"), "b": [1 / 3], 2: torch.tensor([1, 2])}) == {"a": None, "b": [0.333333], "2": [1, 2]}
+    assert plain({"a": float("nan"), "b": [1 / 3], 2: torch.tensor([1, 2])}) == {
+        "a": None,
+        "b": [0.333333],
+        "2": [1, 2],
+    }
     nothing = JointEvidence(0.0, 0.0, float("nan"), 0.0, 0.0, 0.0, 0)
     assert plain(nothing.as_dict())["residual"] is None and nothing.confidence == 0

@@ -30,8 +30,13 @@ from p2gs.types import GaussianTensors, Similarity
 def two_states(transform):
     g, labels = textured_panels()
     means, quats, sh = MovedGaussians(g, labels).moved(transform[None])
-    states = [StateGaussians(0, g), StateGaussians(1, GaussianTensors(means, quats, g.log_scales, g.opacity_logits, sh))]
-    views = {s: TrainingViews(photographs(g, labels, T, s), [64]) for s, T in ((0, torch.eye(4).double()), (1, transform))}
+    states = [
+        StateGaussians(0, g),
+        StateGaussians(1, GaussianTensors(means, quats, g.log_scales, g.opacity_logits, sh)),
+    ]
+    views = {
+        s: TrainingViews(photographs(g, labels, T, s), [64]) for s, T in ((0, torch.eye(4).double()), (1, transform))
+    }
     return states, labels, views
 
 
@@ -70,13 +75,19 @@ def test_joints_say_what_their_transform_does():
 
 def test_free_motions_get_a_type():
     small = se3.from_screw(torch.tensor([0.0, 0, 1]).double(), torch.zeros(3).double(), 0.02)
-    assert name_types(["free", "free", "prismatic"], torch.stack([small, hinge(), hinge()]), 5.0) == ["prismatic", "revolute", "prismatic"]
+    assert name_types(["free", "free", "prismatic"], torch.stack([small, hinge(), hinge()]), 5.0) == [
+        "prismatic",
+        "revolute",
+        "prismatic",
+    ]
     assert torch.equal(constrain("prismatic", small, torch.zeros(3).double())[:3, :3], torch.eye(3).double())
 
 
 def test_without_part_renumbers():
     T = torch.stack([torch.eye(4).double() * k for k in (1, 2, 3)])
-    motions = PartMotions(["a", "b", "c"], T, torch.tensor([0.1, 0.2, 0.3]), [torch.tensor([0, 1, 2, 3])] * 2, [torch.ones(4)] * 2)
+    motions = PartMotions(
+        ["a", "b", "c"], T, torch.tensor([0.1, 0.2, 0.3]), [torch.tensor([0, 1, 2, 3])] * 2, [torch.ones(4)] * 2
+    )
     merged = without_part(motions, 1, 3)
     assert merged.types == ["a", "c"] and merged.labels[0].tolist() == [0, 1, 2, 2] and merged.transforms[1, 0, 0] == 3
     assert without_part(motions, 0, 0).labels[0].tolist() == [0, 0, 1, 2]
@@ -86,14 +97,21 @@ def test_one_part_cut_in_two_becomes_one_and_a_true_part_stays(monkeypatch):
     states, labels, views = two_states(hinge())
     cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
     near = se3.from_screw(torch.tensor([0.0, 0.1, 1]).double(), torch.tensor([0.4, 0.5, 0]).double(), 0.51)
-    motions = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [cut, cut], [torch.ones(len(cut))] * 2)
+    motions = PartMotions(
+        ["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [cut, cut], [torch.ones(len(cut))] * 2
+    )
     stacks = [state_depth(s, views[s.state], 64) for s in states]
-    judge = Judge(SimpleNamespace(search=None), states, views, PolishConfig(levels=[64], level_starts=[0.0]), stacks, 0, "auto")
-    monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", lambda found, T, types: 0.03 * len(types))  # the price of parts alone
+    judge = Judge(
+        SimpleNamespace(search=None), states, views, PolishConfig(levels=[64], level_starts=[0.0]), stacks, 0, "auto"
+    )
+    # the price of parts alone
+    monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", lambda found, T, types: 0.03 * len(types))
     simple = simplify(judge, motions, 0.04)
     assert len(simple) == 1 and torch.equal(simple.labels[0], labels)
     # the start hides one of the pieces: that they touch shows in the end
-    half = PartMotions(["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [labels, cut], [torch.ones(len(cut))] * 2)
+    half = PartMotions(
+        ["revolute"] * 2, torch.stack([hinge(), near]), torch.ones(2), [labels, cut], [torch.ones(len(cut))] * 2
+    )
     simple = simplify(judge, half, 0.04)
     assert len(simple) == 1 and torch.equal(simple.labels[1], labels)
 
@@ -121,12 +139,18 @@ def test_empty_and_unmoving_slots_vanish_with_a_word():
     idle[0, 3] = 0.001
     probs = torch.nn.functional.one_hot(labels, 4).float()
     probs[:20] = torch.tensor([0.0, 0, 1, 0])  # a slot that does not move; the last slot is empty
-    learned = Articulation(states[0].gaussians, probs, ["prismatic"] * 3, torch.stack([slide(), idle, slide()]), torch.ones(3), 0.0)
+    learned = Articulation(
+        states[0].gaussians, probs, ["prismatic"] * 3, torch.stack([slide(), idle, slide()]), torch.ones(3), 0.0
+    )
     config = FinishConfig(polish=PolishConfig(steps=0), clean_neighbours=0)
     assert surviving_slots(learned, learned.part_ids, config) == [1]
     twin, notes, _ = finish(learned, states, views, config, Similarity(), seed=0, backend="auto")
     assert len(twin.parts) == 2 and len(notes) == 2 and "slot 2 of 3 vanished" in notes[0]
     assert twin.parts[1].joint.type == "prismatic" and int(twin.part_ids.max()) == 1
     seen = twin.parts[1].joint.limits
-    further = finish(learned, states, views, replace(config, extend_range=True), Similarity(), seed=0, backend="auto")[0].parts[1].joint
+    further = (
+        finish(learned, states, views, replace(config, extend_range=True), Similarity(), seed=0, backend="auto")[0]
+        .parts[1]
+        .joint
+    )
     assert seen == (0.0, further.motion) and further.limits[0] <= 0.0 and further.limits[1] > seen[1]

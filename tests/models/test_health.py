@@ -1,4 +1,5 @@
-"""A loss that stops being finite, a state that loses its Gaussians, a result with NaN: a sentence, and the last good state on disk."""
+"""A loss that stops being finite, a state that loses its Gaussians, a result with NaN: a sentence, and the last good
+state on disk."""
 
 import pytest
 import torch
@@ -28,8 +29,15 @@ def phase_of(scene, steps=12, **extra):
 
 def fit(phase, folder, *callbacks, until=None):
     steps = until or phase.total_steps
-    options = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
-    trainer = Trainer(max_steps=steps, max_epochs=-1, accelerator="cpu", callbacks=list(callbacks), default_root_dir=folder, **options)
+    options = {
+        "logger": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "enable_checkpointing": False,
+    }
+    trainer = Trainer(
+        max_steps=steps, max_epochs=-1, accelerator="cpu", callbacks=list(callbacks), default_root_dir=folder, **options
+    )
     trainer.fit(phase, datamodule=TinyData())
     return phase
 
@@ -64,7 +72,12 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_state(scene, tmp_pat
     with pytest.raises(LossNotFinite) as raised:
         fit(phase, tmp_path, Checkpoint(every=5))
     said = str(raised.value)
-    assert "not finite at step 7" in said and "odd is" in said and "phases.single_state.losses.odd" in said and "\n" not in said
+    assert (
+        "not finite at step 7" in said
+        and "odd is" in said
+        and "phases.single_state.losses.odd" in said
+        and "\n" not in said
+    )
     stored = torch.load(tmp_path / "checkpoints" / "single_state.ckpt", weights_only=True)
     good = fit(phase_of(scene), tmp_path / "other", until=7)  # never had that loss
     assert stored["global_step"] == 7

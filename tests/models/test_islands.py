@@ -27,7 +27,9 @@ def solid(points, opacity=0.9):
     n = len(points)
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
-    return GaussianTensors(points, quats, torch.full((n, 3), -4.0), torch.logit(torch.full((n,), opacity)), torch.zeros(n, 1, 3))
+    return GaussianTensors(
+        points, quats, torch.full((n, 3), -4.0), torch.logit(torch.full((n,), opacity)), torch.zeros(n, 1, 3)
+    )
 
 
 def push(x):
@@ -71,7 +73,8 @@ def test_an_island_goes_to_what_it_touches():
 
 
 def test_an_island_that_lands_on_its_part_stays():
-    """What the front hides in one state (a gap in the end's part) makes an island of its rest; the start shows that it is none."""
+    """What the front hides in one state (a gap in the end's part) makes an island of its rest; the start shows that it
+    is none."""
     states, labels, _, T = islands_case()
     gap = torch.ones(800, dtype=torch.bool)
     gap[400 + 6 * 20 : 400 + 12 * 20] = False  # six rows of the end's part are not there
@@ -91,7 +94,8 @@ def test_faint_ones_go_with_their_surface():
 def test_seen_from_is_the_mean_direction_to_the_cameras_that_see_a_point():
     eyes = [torch.tensor([3.0, 0.0, 0.0]), torch.tensor([2.4, 1.8, 0.0]), torch.tensor([-3.0, 0.0, 0.0])]
     cameras = [look_at(e, 32) for e in eyes]
-    depths = [torch.full((32, 32), 3.0), torch.full((32, 32), 3.0), torch.full((32, 32), 2.0)]  # the third sees a wall before the point
+    # the third sees a wall before the point
+    depths = [torch.full((32, 32), 3.0), torch.full((32, 32), 3.0), torch.full((32, 32), 2.0)]
     stack = DepthStack(depths, [torch.ones(32, 32)] * 3, cameras)
     found = stack.seen_from(torch.tensor([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]]), 0.02)
     mean = (eyes[0] / 3 + eyes[1] / 3) / 2
@@ -112,11 +116,15 @@ def test_survey_leaves_a_false_minimum(kind, truth):
     off = truth.clone()
     points = se3.apply(truth, states[0].gaussians.means[labels == 1].double()) - centre
     long = torch.linalg.svd(points, full_matrices=False)[2][0]
-    long = long - (se3.screw_parameters(truth).axis * (long @ se3.screw_parameters(truth).axis) if kind == "revolute" else 0)
+    long = long - (
+        se3.screw_parameters(truth).axis * (long @ se3.screw_parameters(truth).axis) if kind == "revolute" else 0
+    )
     off[:3, 3] += 0.12 * long / long.norm()
     margins = [torch.ones(len(labels))] * 2
     motions = PartMotions([kind], off[None], torch.ones(1), [labels, labels], margins)
-    config = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0)
+    config = PolishConfig(
+        steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0
+    )
     stacks = [None, None]  # not looked at: nothing is left out, all views count
     judge = Judge(SimpleNamespace(search=None), states, views, config, stacks, 0, "auto")
     assert survey(states, motions, views, config, stacks, [], backend="auto")[1] == []
@@ -130,7 +138,8 @@ def test_survey_leaves_a_false_minimum(kind, truth):
 
 @pytest.mark.parametrize("wall_in_front", [True, False])
 def test_a_twins_island_goes_to_what_it_touches_unless_that_is_seen_through(wall_in_front):
-    """A patch amid the base is labelled as the part; the other state's camera sees a wall before it all, or looks past everything."""
+    """A patch amid the base is labelled as the part; the other state's camera sees a wall before it all, or looks past
+    everything."""
     base, part = sheet([0.0, 0, 0]), sheet([0.0, 0, 1.0])
     points = torch.cat([base, part])
     right = torch.tensor([0] * 400 + [1] * 400)

@@ -1,4 +1,5 @@
-"""A joint's confidence falls with its error, with lost support and with two directions that disagree; it needs no ground truth."""
+"""A joint's confidence falls with its error, with lost support and with two directions that disagree; it needs no
+ground truth."""
 
 from dataclasses import replace
 
@@ -21,8 +22,14 @@ def world(transform):
     g, labels = textured_panels(1600)
     g.log_scales.fill_(-3.5)
     means, quats, sh = MovedGaussians(g, labels).moved(transform[None])
-    states = [StateGaussians(0, g), StateGaussians(1, GaussianTensors(means, quats, g.log_scales, g.opacity_logits, sh))]
-    views = {s: TrainingViews(photographs(g, labels, T, s, SIZE), [SIZE]) for s, T in ((0, torch.eye(4).double()), (1, transform))}
+    states = [
+        StateGaussians(0, g),
+        StateGaussians(1, GaussianTensors(means, quats, g.log_scales, g.opacity_logits, sh)),
+    ]
+    views = {
+        s: TrainingViews(photographs(g, labels, T, s, SIZE), [SIZE])
+        for s, T in ((0, torch.eye(4).double()), (1, transform))
+    }
     return states, labels, views
 
 
@@ -121,7 +128,12 @@ def test_a_part_that_no_photograph_shows_has_no_confidence(door):
 def test_confidence_is_a_probability_that_falls_with_each_measure():
     clean = JointEvidence(coverage=0.9, contradicted=0.0, residual=1.0, rise=0.1, fall=0.0, disagreement=0.001, views=4)
     assert 0.9 < clean.confidence < 1
-    for name, values in {"contradicted": (0.2, 0.6), "rise": (0.03, 0.01), "fall": (0.05, 0.09), "disagreement": (0.01, 0.05)}.items():
+    for name, values in {
+        "contradicted": (0.2, 0.6),
+        "rise": (0.03, 0.01),
+        "fall": (0.05, 0.09),
+        "disagreement": (0.01, 0.05),
+    }.items():
         found = [clean.confidence, *(replace(clean, **{name: v}).confidence for v in values)]
         assert found == sorted(found, reverse=True) and len(set(found)) == 3, name
     worst = replace(clean, contradicted=0.5, rise=0.0, fall=0.1, disagreement=0.05)

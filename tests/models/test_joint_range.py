@@ -1,4 +1,5 @@
-"""A joint followed on beyond what was photographed: a door stops at its frame and at a wall, a drawer at the back, nothing stops in air."""
+"""A joint followed on beyond what was photographed: a door stops at its frame and at a wall, a drawer at the back,
+nothing stops in air."""
 
 import math
 from dataclasses import replace
@@ -15,7 +16,8 @@ GREY = (0.5, 0.5, 0.5)
 
 
 def cabinet(joint, moving, fixed, open_by=0.0):
-    """A twin of a cabinet shell plus ``fixed`` panels and one part; the part's panels are given shut, the start state is ``open_by``."""
+    """A twin of a cabinet shell plus ``fixed`` panels and one part; the part's panels are given shut, the start state
+    is ``open_by``."""
     shell = box((-0.5, -0.4, -0.5), (0.5, 0.4, 0.5), GREY, skip=("-y",)) + fixed
     sets = [gaussians_of(p, 0) for p in (shell, moving)]
     ids = torch.cat([torch.full((len(g),), k, dtype=torch.int64) for k, g in enumerate(sets)])
@@ -105,7 +107,10 @@ def test_export_writes_the_extended_limits_and_leaves_the_twin(tmp_path):
     for state in ("start", "end"):
         (tmp_path / "meshes" / state).mkdir(parents=True)
         for k in (0, 1):
-            write_mesh(tmp_path / "meshes" / state / f"part_{k}.ply", Mesh((wall, corners)[k], faces, np.zeros((len(corners), 3), np.uint8)))
+            write_mesh(
+                tmp_path / "meshes" / state / f"part_{k}.ply",
+                Mesh((wall, corners)[k], faces, np.zeros((len(corners), 3), np.uint8)),
+            )
     before = (tmp_path / "twin.json").read_bytes()
 
     def limits(*words):

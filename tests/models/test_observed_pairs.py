@@ -19,7 +19,11 @@ def setting(n=2000, parts=4):
 def test_rotations_are_those_of_kabsch():
     paired, mu0, mu1, probs = setting()
     pairs = ObservedPairs(paired, mu0, mu1)
-    assert torch.equal(pairs.index, paired.nonzero()[:, 0]) and torch.equal(pairs.mu0, mu0[paired]) and torch.equal(pairs.mu1, mu1[paired])
+    assert (
+        torch.equal(pairs.index, paired.nonzero()[:, 0])
+        and torch.equal(pairs.mu0, mu0[paired])
+        and torch.equal(pairs.mu1, mu1[paired])
+    )
     expected, _ = so3.kabsch(mu0[paired].double(), mu1[paired].double(), probs[paired].T.double() + 1e-9)
     torch.testing.assert_close(pairs.rotations(probs).double(), expected, rtol=0, atol=1e-6)
 

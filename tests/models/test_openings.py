@@ -31,7 +31,9 @@ def panel(corner, u, v, colour, step=0.035) -> GaussianTensors:
     scales = torch.where(thin, 0.003, 0.5 * step).log().expand(len(points), 3).clone()
     rgb = colour(points) if callable(colour) else torch.tensor(colour).expand(len(points), 3)
     sh = rgb_to_dc(rgb)[:, None]
-    return GaussianTensors(points, torch.tensor([1.0, 0, 0, 0]).repeat(len(points), 1), scales, torch.full((len(points),), 4.0), sh)
+    return GaussianTensors(
+        points, torch.tensor([1.0, 0, 0, 0]).repeat(len(points), 1), scales, torch.full((len(points),), 4.0), sh
+    )
 
 
 def speckled(points):
@@ -69,9 +71,15 @@ def photograph(g: GaussianTensors, state: int) -> list[View]:
     for k in range(16):
         angle = torch.tensor(k * 2 * torch.pi / 16)
         camera = look_at(torch.stack([2.2 * angle.sin(), 2.2 * angle.cos(), torch.tensor(0.5 if k % 2 else 0.1)]), SIZE)
-        out = rasterize_stored(g.means, g.quats, g.log_scales, g.opacity_logits, g.sh, None, camera.viewmat, camera.K, SIZE, SIZE)
+        out = rasterize_stored(
+            g.means, g.quats, g.log_scales, g.opacity_logits, g.sh, None, camera.viewmat, camera.K, SIZE, SIZE
+        )
         colour = (out.colour / out.alpha.clamp_min(1e-3)[..., None]).clamp(0, 1)
-        views.append(View(f"{state}_{k}", state, "train", camera, (colour * 255).round().byte(), (out.alpha * 255).round().byte()))
+        views.append(
+            View(
+                f"{state}_{k}", state, "train", camera, (colour * 255).round().byte(), (out.alpha * 255).round().byte()
+            )
+        )
     return views
 
 
@@ -82,7 +90,8 @@ def opened(g: GaussianTensors) -> GaussianTensors:
 
 
 def scene(lid: GaussianTensors, truth: list[GaussianTensors]):
-    """The shut and the open chest as trained (the open one with ``lid``), photographs of what it is (``truth`` inside), motions, depth."""
+    """The shut and the open chest as trained (the open one with ``lid``), photographs of what it is (``truth`` inside),
+    motions, depth."""
     swung = opened(door())
     trained = [GaussianTensors.cat([outer(), door()]), GaussianTensors.cat([outer(), swung, lid])]
     real = [trained[0], GaussianTensors.cat([outer(), swung, *truth])]
@@ -101,7 +110,11 @@ def test_a_lid_gives_way_to_the_walls_behind_it():
     lid = panel([-0.37, 0.2, -0.27], [0.74, 0, 0], [0, 0, 0.54], DARK)
     states, motions, views, stacks = scene(lid, [panel(*side, DARK) for side in INSIDE])
     out, told, depth, counted = open_up(states, motions, views, stacks, OpeningsConfig(), backend="auto")
-    assert counted[0]["removed"] == 0 and out[0].kept.all() and len(out[0].of(states[0]).gaussians) == len(states[0].gaussians)
+    assert (
+        counted[0]["removed"] == 0
+        and out[0].kept.all()
+        and len(out[0].of(states[0]).gaussians) == len(states[0].gaussians)
+    )
     # what shows through the opening is gone; the lid's rim, which stands before a wall, may stay
     assert counted[1]["removed"] > 0.6 * len(lid) and counted[1]["added"] > 100
     g, kept = out[1].of(states[1]).gaussians, len(states[1].gaussians) - counted[1]["removed"]
@@ -111,11 +124,14 @@ def test_a_lid_gives_way_to_the_walls_behind_it():
     walls = torch.cat([panel(*side, DARK).means for side in INSIDE])
     assert float(torch.cdist(room, walls).min(1).values.quantile(0.95)) < 0.06  # a wall's thickness is assumed
     assert float((colour - torch.tensor(DARK)).abs().mean()) < 0.05
-    deeper = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.1, 0.0]])  # between lid and back wall: hidden before, seen through now
+    # between lid and back wall: hidden before, seen through now
+    deeper = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.1, 0.0]])
     assert (stacks[1].counts(deeper, 0.02)[0] == 0).all() and (depth[1].counts(deeper, 0.02)[0] > 0).all()
     again = open_up(states, motions, views, stacks, OpeningsConfig(), backend="auto")
     assert torch.equal(again[0][1].of(states[1]).gaussians.means, g.means)
-    further = replace(states[1], gaussians=states[1].gaussians.placed(states[1].gaussians.means + 1.0, states[1].gaussians.quats))
+    further = replace(
+        states[1], gaussians=states[1].gaussians.placed(states[1].gaussians.means + 1.0, states[1].gaussians.quats)
+    )
     assert torch.equal(out[1].of(further).gaussians.means[:kept], g.means[:kept] + 1.0)
 
 
@@ -134,7 +150,9 @@ def test_each_kind_may_be_explained_worse_by_its_own_measure(kind):
     if kind != "base":
         forth = torch.eye(4).double()
         forth[1, 3] = 0.1
-        motions = replace(motions, types=["revolute", kind], transforms=torch.stack([HINGE, forth]), confidence=torch.ones(2))
+        motions = replace(
+            motions, types=["revolute", kind], transforms=torch.stack([HINGE, forth]), confidence=torch.ones(2)
+        )
         motions.labels[1][-len(lid) :] = 2
     names = {"base": "may_lose", "revolute": "doors", "prismatic": "drawers"}
     for told in names:
@@ -144,7 +162,12 @@ def test_each_kind_may_be_explained_worse_by_its_own_measure(kind):
 
 
 def test_what_hangs_apart_from_a_drawer_is_taken_for_a_doors():
-    groups = [outer(), panel([0, 0.5, 0], [0.5, 0, 0], [0, 0, 0.3], DARK), panel([0, 0.8, 0], [0.1, 0, 0], [0, 0, 0.1], DARK), door()]
+    groups = [
+        outer(),
+        panel([0, 0.5, 0], [0.5, 0, 0], [0, 0, 0.3], DARK),
+        panel([0, 0.8, 0], [0.1, 0, 0], [0, 0, 0.1], DARK),
+        door(),
+    ]
     labels = torch.cat([torch.full((len(g),), k) for g, k in zip(groups, (0, 1, 1, 2), strict=True)])
     want = torch.cat([torch.full((len(g),), k) for g, k in zip(groups, (BASE, DRAWER, DOOR, DOOR), strict=True)])
     assert torch.equal(kinds(GaussianTensors.cat(groups), labels, ["prismatic", "revolute"]), want)

@@ -26,14 +26,23 @@ def moved(g: GaussianTensors) -> GaussianTensors:
 
 
 def chest(kinds=("prismatic", "prismatic")):
-    """A chest with two drawers side by side, shut (their floors unseen) and open; the right one's floor is labelled as the left one's."""
-    pieces = [[outer(), front(True), front(False)], [outer(), *(moved(x) for x in (front(True), front(False), floor(True), floor(False)))]]
+    """A chest with two drawers side by side, shut (their floors unseen) and open; the right one's floor is labelled as
+    the left one's."""
+    pieces = [
+        [outer(), front(True), front(False)],
+        [outer(), *(moved(x) for x in (front(True), front(False), floor(True), floor(False)))],
+    ]
     given = [[0, 1, 2], [0, 1, 2, 1, 1]]
     states = [GaussianTensors.cat(p) for p in pieces]
-    labels = [torch.cat([torch.full((len(g),), k) for g, k in zip(p, ks, strict=True)]) for p, ks in zip(pieces, given, strict=True)]
+    labels = [
+        torch.cat([torch.full((len(g),), k) for g, k in zip(p, ks, strict=True)])
+        for p, ks in zip(pieces, given, strict=True)
+    ]
     slide = torch.eye(4).double()
     slide[1, 3] = OUT
-    motions = PartMotions(list(kinds), torch.stack([slide, slide]), torch.ones(2), labels, [torch.ones(len(x)) for x in labels])
+    motions = PartMotions(
+        list(kinds), torch.stack([slide, slide]), torch.ones(2), labels, [torch.ones(len(x)) for x in labels]
+    )
     stacks = []
     for s, g in enumerate(states):
         e = gather_evidence(g, photograph(g, s), SIZE, 0.5)
@@ -45,9 +54,14 @@ def test_a_drawers_floor_goes_to_the_front_that_hides_it():
     states, motions, stacks, sizes = chest()
     told, changed = hidden_to_owners(states, motions, stacks, backend="auto")
     base, left, right, left_floor, right_floor = torch.split(told.labels[1], sizes)
-    assert (right_floor == 2).float().mean() > 0.7 and (left_floor == 1).float().mean() > 0.95  # its far end lies behind both
+    assert (right_floor == 2).float().mean() > 0.7 and (
+        left_floor == 1
+    ).float().mean() > 0.95  # its far end lies behind both
     assert (base == 0).all() and (left == 1).all() and (right == 2).all()
-    assert torch.equal(told.labels[0], motions.labels[0]) and changed == [0, int((right_floor == 2).sum() + (left_floor != 1).sum())]
+    assert torch.equal(told.labels[0], motions.labels[0]) and changed == [
+        0,
+        int((right_floor == 2).sum() + (left_floor != 1).sum()),
+    ]
     assert (motions.labels[1][-sizes[-1] :] == 1).all()  # what was given is not written to
 
 
@@ -74,14 +88,19 @@ def test_what_belongs_to_the_base_or_is_seen_stays():
 
 def test_what_its_part_never_hides_need_not_have_moved():
     states, motions, stacks, sizes = chest()
-    maps = label_maps(states[0].gaussians, torch.zeros_like(motions.labels[0]), 3, stacks[0], "auto", "cpu")  # all of it the base's
+    # all of it the base's
+    maps = label_maps(states[0].gaussians, torch.zeros_like(motions.labels[0]), 3, stacks[0], "auto", "cpu")
     g, away = states[1].gaussians, se3.inverse(motions.transforms)
     inside = g.placed(g.means - torch.tensor([0.0, 0.18, 0.0]), g.quats)  # the floors, hidden where they are as well
     rows = torch.arange(len(g) - sizes[-1], len(g))
     rows = rows[(inside.means[rows, 1] > 0.0) & (inside.means[rows, 1] < 0.25)]
     group, takers = torch.zeros(len(rows), dtype=torch.int64), torch.tensor([False, True, True])
-    assert len(rows) > 20 and (owners(inside, motions.labels[1], away, stacks[0], maps, group, rows, takers)[rows] == 0).all()
-    out = g.placed(g.means + torch.tensor([0.0, 0.3, 0.0]), g.quats)  # hidden once carried back as far, but seen to be empty where they are
+    assert (
+        len(rows) > 20
+        and (owners(inside, motions.labels[1], away, stacks[0], maps, group, rows, takers)[rows] == 0).all()
+    )
+    # hidden once carried back as far, but seen to be empty where they are
+    out = g.placed(g.means + torch.tensor([0.0, 0.3, 0.0]), g.quats)
     away[:, 1, 3] -= 0.45
     assert (owners(out, motions.labels[1], away, stacks[0], maps, group, rows, takers)[rows] == 1).all()
 

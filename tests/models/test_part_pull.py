@@ -19,7 +19,13 @@ def setting(n, dtype=torch.float32):
     labels = torch.randint(0, 4, (n,), generator=g)
     labels[labels == 2] = 0  # a part without Gaussians
     turns = so3.rotvec_to_matrix(torch.randn(3, 3, generator=g).double())
-    return means, quats, Parts(labels), torch.randn(3, 3, generator=g).double(), (seen, turns, torch.tensor([0.3, 2.0, -1.0]), 0.2)
+    return (
+        means,
+        quats,
+        Parts(labels),
+        torch.randn(3, 3, generator=g).double(),
+        (seen, turns, torch.tensor([0.3, 2.0, -1.0]), 0.2),
+    )
 
 
 @pytest.mark.parametrize("n", [0, 1, 40, 3000])

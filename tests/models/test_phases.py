@@ -10,12 +10,13 @@ from p2gs.callbacks.checkpoint import Checkpoint
 from p2gs.callbacks.densify import Densify
 from p2gs.data.views import TrainingViews
 from p2gs.gaussians import handover
+from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.losses.base import LOSSES
 from p2gs.models.articulation import ArticulationConfig, ArticulationPhase
 from p2gs.models.canonical_fusion import CanonicalFusionConfig, CanonicalFusionPhase
 from p2gs.models.sharpen import SharpenConfig, SharpenPhase
-from p2gs.models.single_state import SingleStateConfig, SingleStatePhase, SplatRates, render_gaussians
+from p2gs.models.single_state import SingleStateConfig, SingleStatePhase, SplatRates
 from p2gs.motion.screw_polish import MovedGaussians
 from p2gs.ops import se3, so3
 from p2gs.types import GaussianTensors, UserError
@@ -50,7 +51,9 @@ def build(name, scene, views, chosen=None, **options):
     common = {"seed": 3, "rasterizer": "auto"}
     if name == "single_state":
         config = SingleStateConfig(steps=24, initial_gaussians=200, levels=[24, 48], level_starts=[0.0, 0.5], **options)
-        return SingleStatePhase(config, losses(*(chosen or ("render", "alpha", "depth_variance"))), scene, 0, views[0], **common)
+        return SingleStatePhase(
+            config, losses(*(chosen or ("render", "alpha", "depth_variance"))), scene, 0, views[0], **common
+        )
     states, motions = states_and_motions()
     if name == "sharpen":
         config = SharpenConfig(steps=24, levels=[48], **options)
@@ -61,7 +64,9 @@ def build(name, scene, views, chosen=None, **options):
         return CanonicalFusionPhase(config, losses(*(chosen or ("render",))), states, motions, views, **common)
     config = ArticulationConfig(steps=24, levels=[48], refresh=4, **options)
     fused = CanonicalFusionPhase(CanonicalFusionConfig(), {}, states, motions, views, **common).hand_over()
-    return ArticulationPhase(config, losses(*(chosen or ARTICULATION_LOSSES)), fused, states, motions, 2, 2.0, views, **common)
+    return ArticulationPhase(
+        config, losses(*(chosen or ARTICULATION_LOSSES)), fused, states, motions, 2, 2.0, views, **common
+    )
 
 
 def fit(phase, folder, until=None, resume=None, densify=True):
@@ -105,7 +110,8 @@ def test_same_bits_for_any_number_of_threads(name, scene, views, tmp_path):
 def test_resume_is_bit_exact_across_densification(name, scene, views, tmp_path):
     densify = name != "sharpen"  # labels of discovery go by number
     whole = fit(build(name, scene, views), tmp_path / "whole", densify=densify)
-    fit(build(name, scene, views), tmp_path / "cut", until=14, densify=densify)  # killed: the newest checkpoint is of step 12
+    # killed: the newest checkpoint is of step 12
+    fit(build(name, scene, views), tmp_path / "cut", until=14, densify=densify)
     resume = str(tmp_path / "cut" / "checkpoints" / f"{whole.phase_name}.ckpt")
     cut = fit(build(name, scene, views), tmp_path / "cut", resume=resume, densify=densify)
     assert whole.step == cut.step == 24
@@ -124,7 +130,8 @@ def test_single_state_learns_the_image(scene, views, tmp_path):
 
 
 def test_sharpening_goes_over_to_other_pixels(scene, views, tmp_path):
-    """The panels were photographed with classic pixels: drawn with sharp ones they look wrong until they have been fitted to them."""
+    """The panels were photographed with classic pixels: drawn with sharp ones they look wrong until they have been
+    fitted to them."""
     phase = build("sharpen", scene, views, rates=SplatRates(1e-4, 4e-6, 1e-2, 5e-2, 1e-3, 1e-2, 1e-3))
     phase.config.steps = 120
     before = phase.splats.tensors().clone()
@@ -133,7 +140,12 @@ def test_sharpening_goes_over_to_other_pixels(scene, views, tmp_path):
 
     def error(g, backend):
         shots = [views[1].get(i, 1, torch.ones(3)) for i in range(8)]
-        return float(sum((render_gaussians(g, s.camera, torch.ones(3), backend=backend).colour - s.image).square().mean() for s in shots))
+        return float(
+            sum(
+                (render_gaussians(g, s.camera, torch.ones(3), backend=backend).colour - s.image).square().mean()
+                for s in shots
+            )
+        )
 
     assert phase.rasterizer == "auto:sharp" and after.state == 1 and len(after.gaussians) == len(before)
     assert error(before, "auto:classic") < error(before, "auto:sharp")
@@ -189,7 +201,9 @@ def test_hand_over_survives_the_disk(scene, views, tmp_path):
     assert header == {"key": "k"} and loaded.types == ["revolute"]
     assert torch.equal(loaded.probs, result.probs) and torch.equal(loaded.gaussians.sh, result.gaussians.sh)
     assert torch.allclose(loaded.transforms[0], hinge(), atol=1e-5)
-    assert (loaded.part_ids == torch.as_tensor(states_and_motions()[1].labels[0])[: len(loaded.part_ids)]).float().mean() > 0.9
+    assert (
+        loaded.part_ids == torch.as_tensor(states_and_motions()[1].labels[0])[: len(loaded.part_ids)]
+    ).float().mean() > 0.9
 
 
 def test_previews_are_pictures(scene, views):

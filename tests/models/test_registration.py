@@ -1,4 +1,5 @@
-"""The end state in the start's frame: the base's small motion found beside what really moved, applied only where photographs say so."""
+"""The end state in the start's frame: the base's small motion found beside what really moved, applied only where
+photographs say so."""
 
 from dataclasses import replace
 
@@ -11,7 +12,15 @@ from p2gs.data.exposure import brightened, corrected, encoded, linear, median_ga
 from p2gs.data.views import TrainingViews
 from p2gs.gaussians.frame import camera_to_input
 from p2gs.gaussians.handover import Registration, StateGaussians, ViewCorrections
-from p2gs.models.registered import as_fitted, correct_scene, dimmed, read_registration, register_state, register_views, write_registration
+from p2gs.models.registered import (
+    as_fitted,
+    correct_scene,
+    dimmed,
+    read_registration,
+    register_state,
+    register_views,
+    write_registration,
+)
 from p2gs.models.registration import RegistrationConfig, align_states
 from p2gs.models.trial import held_out, trial
 from p2gs.motion.surface_fit import fit_surfaces
@@ -54,11 +63,14 @@ def cupboard(open_by: float, noise: float, seed: int) -> Surfels:
 
 @pytest.mark.parametrize("open_by, limit", [(0.05, 0.15), (0.3, 0.06), (1.2, 0.06)])
 def test_surfaces_ignore_the_door(open_by, limit):
-    """Also a door that is only ajar, by three degrees: next to its hinge it has not moved farther than the surfaces' noise.
-    Photographs take it from here."""
+    """Also a door that is only ajar, by three degrees: next to its hinge it has not moved farther than the surfaces'
+    noise. Photographs take it from here."""
     start, end = cupboard(0.0, 0.002, 1), cupboard(open_by, 0.002, 2)
     back = se3.inverse(BESIDE)
-    end.points, end.normals = se3.apply(back, end.points.double()).float(), (end.normals.double() @ back[:3, :3].T).float()
+    end.points, end.normals = (
+        se3.apply(back, end.points.double()).float(),
+        (end.normals.double() @ back[:3, :3].T).float(),
+    )
     found = fit_surfaces(end, start, 0.06)
     left = se3.inverse(BESIDE) @ found.transform
     assert degrees(left) < limit and left[:3, 3].norm() < 1e-3
@@ -88,7 +100,8 @@ def test_trial_wants_size_and_certainty():
 
 
 def panels(dim: float, beside: torch.Tensor) -> tuple[list[StateGaussians], TwoStateScene]:
-    """Two perfect states, 0.6 radians of one panel apart; the end's world lies ``beside`` the start's and is exp(dim) as bright."""
+    """Two perfect states, 0.6 radians of one panel apart; the end's world lies ``beside`` the start's and is exp(dim)
+    as bright."""
     g, labels = textured_panels(1500)
     turn = se3.from_screw(torch.tensor([0.0, 0, 1]).double(), torch.tensor([0.4, 0.5, 0]).double(), 0.6)
     views, states = [], []
@@ -96,7 +109,10 @@ def panels(dim: float, beside: torch.Tensor) -> tuple[list[StateGaussians], TwoS
         shots = photographs(g, labels, T, state, 96, 12)
         moved = register_state(StateGaussians(1, g), Registration(T, torch.zeros(3))).gaussians
         own = type(g)(
-            *(torch.where((labels == 1).view(-1, *[1] * (getattr(g, n).dim() - 1)), getattr(moved, n), getattr(g, n)) for n in g.NAMES)
+            *(
+                torch.where((labels == 1).view(-1, *[1] * (getattr(g, n).dim() - 1)), getattr(moved, n), getattr(g, n))
+                for n in g.NAMES
+            )
         )
         states.append(StateGaussians(state, own))
         views += shots
@@ -116,7 +132,9 @@ def test_misaligned_and_darker():
     states, scene = panels(-0.16, BESIDE)
     found = aligned(states, scene, said.append)
     still = textured_panels(1500)[0].means[::2].double()  # one thin panel is all that stayed
-    off, left = (float((se3.apply(T, still) - still).norm(dim=1).mean()) for T in (BESIDE, se3.inverse(BESIDE) @ found.transform))
+    off, left = (
+        float((se3.apply(T, still) - still).norm(dim=1).mean()) for T in (BESIDE, se3.inverse(BESIDE) @ found.transform)
+    )
     assert left < 0.2 * off, (left, off, said)
     assert torch.allclose(found.log_gain, torch.full((3,), -0.16), atol=0.03)
     assert found.figures["motion"]["applied"] and found.figures["gain"]["applied"] and len(said) == 2
@@ -149,7 +167,9 @@ def test_kept_in_the_inputs_coordinates(tmp_path):
     found = Registration(BESIDE, torch.tensor([0.1, 0.2, 0.3]), {"share": 0.7})
     write_registration(tmp_path / "registration.json", found, states, inner)
     outer = inner.with_views(replace(v, camera=camera_to_input(v.camera, similarity)) for v in inner.views)
-    for want, got in zip(register_views(correct_scene(inner, states), found).views, as_fitted(outer, tmp_path).views, strict=True):
+    for want, got in zip(
+        register_views(correct_scene(inner, states), found).views, as_fitted(outer, tmp_path).views, strict=True
+    ):
         assert torch.allclose(camera_to_input(want.camera, similarity).viewmat, got.camera.viewmat, atol=1e-5)
         assert torch.equal(want.image, got.image)
     assert read_registration(tmp_path / "registration.json")[0].figures == {"share": 0.7}
@@ -158,4 +178,6 @@ def test_kept_in_the_inputs_coordinates(tmp_path):
 
 def corrections(count: int, seed: int) -> ViewCorrections:
     gen = torch.Generator().manual_seed(seed)
-    return ViewCorrections(se3.exp(0.01 * torch.randn(count, 6, generator=gen).double()), 0.1 * torch.randn(count, 3, generator=gen))
+    return ViewCorrections(
+        se3.exp(0.01 * torch.randn(count, 6, generator=gen).double()), 0.1 * torch.randn(count, 3, generator=gen)
+    )

@@ -5,7 +5,7 @@ import torch
 from tiny import hinge, photographs, slide, textured_panels
 
 from p2gs.data.views import TrainingViews
-from p2gs.models.canonical import carry, with_static
+from p2gs.gaussians.pose import carry, with_static
 from p2gs.motion.part_pull import tangent_gradient
 from p2gs.motion.screw_polish import PolishConfig, Side, allowed_step, apply_step, polish
 from p2gs.ops import se3, so3

@@ -30,11 +30,15 @@ def scene(monkeypatch):
     states, labels, views = two_states(slide())
     margins = [torch.ones(len(labels))] * 2
     sure = SimpleNamespace(confidence=0.5)
-    monkeypatch.setattr(settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types)))
+    monkeypatch.setattr(
+        settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
+    )
     monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
 
     def reconsider(kind, T, proposed, more=(), limit=1):
-        monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: more if part is None else proposed)
+        monkeypatch.setattr(
+            settle, "instead_of", lambda found, transforms, types, part: more if part is None else proposed
+        )
         motions = PartMotions([kind], T[None], torch.ones(1), [labels, labels], margins)
         return motions, *settle.reconsider(judge_of(states, views), motions, limit, PartMotionsConfig())
 
@@ -48,7 +52,11 @@ def test_a_wrong_motion_is_exchanged_for_a_proposed_one_that_is_refined(scene):
     _, found, log = scene("revolute", wrong, [(hinge(), "revolute"), (near, "prismatic")])
     assert found.types == ["prismatic"] and log[0]["type"] == "prismatic" and log[0]["change"] == "exchanged"
     assert float((found.transforms[0] - slide()).norm()) < 0.01  # refined, from 0.035
-    assert log[0]["after"] < log[0]["cost"] and log[0]["energy"] < log[0]["proposed"] < 0 and found.confidence.tolist() == [0.5]
+    assert (
+        log[0]["after"] < log[0]["cost"]
+        and log[0]["energy"] < log[0]["proposed"] < 0
+        and found.confidence.tolist() == [0.5]
+    )
 
 
 def test_a_right_motion_stays(scene):
@@ -62,18 +70,24 @@ def test_a_further_part_must_win_by_more(scene):
     other = slide()
     other[:3, 3] *= -1
     motions, found, log = scene("prismatic", slide(), [], [(other, "prismatic")], limit=2)
-    assert found is motions and [entry["change"] for entry in log] == ["added"]  # no Gaussian is its own, the images stay as they are
+    # no Gaussian is its own, the images stay as they are
+    assert found is motions and [entry["change"] for entry in log] == ["added"]
     assert scene("prismatic", slide(), [], [(other, "prismatic")], limit=1)[2] == []  # no more parts than allowed
 
 
 def second_owns_the_panel(monkeypatch):
-    """States, labels, views and margins of one panel that slides, and its slide a little off; a second part, once there is one, owns it."""
+    """States, labels, views and margins of one panel that slides, and its slide a little off; a second part, once there
+    is one, owns it."""
     states, labels, views = two_states(slide())
     margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.5)
     off = slide()
     off[:3, 3] += torch.tensor([0.0, 0.05, 0.0])
-    monkeypatch.setattr(settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types)))
-    monkeypatch.setattr(settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins))
+    monkeypatch.setattr(
+        settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
+    )
+    monkeypatch.setattr(
+        settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins)
+    )
     return states, labels, views, margins, off
 
 
@@ -83,7 +97,11 @@ def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
     monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", lambda found, T, types: -10.0 * len(types))
 
     def added(start, further):
-        monkeypatch.setattr(settle, "instead_of", lambda found, transforms, types, part: [(further, "prismatic")] if part is None else [])
+        monkeypatch.setattr(
+            settle,
+            "instead_of",
+            lambda found, transforms, types, part: [(further, "prismatic")] if part is None else [],
+        )
         motions = PartMotions(["prismatic"], start[None], torch.ones(1), [labels, labels], margins)
         return len(settle.reconsider(judge_of(states, views), motions, 2, PartMotionsConfig())[0])
 
@@ -93,10 +111,14 @@ def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
 def test_two_bodies_with_amounts_of_their_own_are_taken_where_the_energy_falls(monkeypatch):
     states, labels, views, margins, off = second_owns_the_panel(monkeypatch)
     monkeypatch.setattr(settle, "instead_of", lambda *a: [])
-    monkeypatch.setattr(settle, "in_two", lambda found, T, types: [(0, torch.stack([T[0], slide()]), [*types, "prismatic"])])
+    monkeypatch.setattr(
+        settle, "in_two", lambda found, T, types: [(0, torch.stack([T[0], slide()]), [*types, "prismatic"])]
+    )
     motions = PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], margins)
     for price, parts in ((0.01, 2), (9.0, 1)):
-        monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", lambda found, T, types, price=price: price * len(types))
+        monkeypatch.setattr(
+            "p2gs.motion.refine_motions.surface_energy", lambda found, T, types, price=price: price * len(types)
+        )
         found, log = settle.reconsider(judge_of(states, views), motions, 2, PartMotionsConfig())
         assert len(found) == parts and log[0]["change"] == "parted"
 
@@ -112,7 +134,9 @@ def test_a_part_of_which_one_state_shows_nothing_is_dropped(monkeypatch):
     monkeypatch.setattr(settle, "relabel", relabel)
     monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
     judge = judge_of(states, views)
-    two = PartMotions(["revolute", "prismatic"], torch.stack([hinge(), slide()]), torch.tensor([0.01, 0.4]), [labels * 2] * 2, margins)
+    two = PartMotions(
+        ["revolute", "prismatic"], torch.stack([hinge(), slide()]), torch.tensor([0.01, 0.4]), [labels * 2] * 2, margins
+    )
     kept, gone = settle.drop_unfounded(judge, two, 0.02)
     assert kept.types == ["prismatic"] and told == [["prismatic"]]
     assert gone == [{"type": "revolute", "confidence": pytest.approx(0.01)}]

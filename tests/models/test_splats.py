@@ -12,7 +12,9 @@ from p2gs.types import UserError
 
 def trained(n: int = 6) -> tuple[Splats, torch.optim.Adam]:
     splats = Splats(
-        random_gaussians(n), extra={"psi": torch.arange(n * 2.0).reshape(n, 2)}, carried={"mu0": torch.arange(n * 3.0).reshape(n, 3)}
+        random_gaussians(n),
+        extra={"psi": torch.arange(n * 2.0).reshape(n, 2)},
+        carried={"mu0": torch.arange(n * 3.0).reshape(n, 3)},
     )
     optimizer = torch.optim.Adam([{"params": [p], "name": name} for name, p in splats.named_parameters()], lr=0.1)
     for _ in range(3):
@@ -68,7 +70,9 @@ def test_densify_prunes_faint_and_copies_the_needy():
     splats.grad_sum.copy_(torch.tensor([9.0, 0, 0, 5, 0, 3, 0, 0]))
     splats.seen.fill_(1)
     means = splats.means.detach().clone()
-    added, pruned = densify(splats, optimizer, 9, generator=torch.Generator().manual_seed(0), max_growth=1.0, split_scale=1.0)
+    added, pruned = densify(
+        splats, optimizer, 9, generator=torch.Generator().manual_seed(0), max_growth=1.0, split_scale=1.0
+    )
     assert (added, pruned) == (2, 1)  # only two have a gradient; the faint one went although its gradient was largest
     assert torch.allclose(splats.means[:7], means[1:], atol=1e-6)
     assert (splats.means[7] - means[3]).norm() < 0.2 and (splats.means[8] - means[5]).norm() < 0.2
@@ -94,8 +98,11 @@ def test_growth_by_threshold_takes_what_exceeds_it_and_needs_no_budget():
     splats, optimizer = trained(8)
     splats.opacity_logits.data.fill_(2.0)
     splats.grad_sum, splats.seen = torch.tensor([8.0, 0, 3, 0, 0, 6, 0, 0]), torch.full((8,), 2.0)
-    added, pruned = densify(splats, optimizer, None, threshold=0.9, max_scale=9.0, generator=torch.Generator().manual_seed(0))
-    assert (added, pruned, len(splats)) == (2, 0, 10)  # means 4 and 3 per image height are 2 and 1.5 per half of it; 1.5 is 0.75
+    added, pruned = densify(
+        splats, optimizer, None, threshold=0.9, max_scale=9.0, generator=torch.Generator().manual_seed(0)
+    )
+    # means 4 and 3 per image height are 2 and 1.5 per half of it; 1.5 is 0.75
+    assert (added, pruned, len(splats)) == (2, 0, 10)
     with pytest.raises(ValueError, match="target or a threshold"):
         densify(splats, optimizer, None, generator=torch.Generator())
     with pytest.raises(UserError, match="threshold above 0"):
@@ -106,6 +113,11 @@ def test_opacities_are_reset_with_their_moments():
     splats, optimizer = trained()
     splats.opacity_logits.data.copy_(torch.linspace(-8, 8, 6))
     reset_opacity(splats, optimizer, 0.01)
-    assert torch.sigmoid(splats.opacity_logits).max().item() == pytest.approx(0.01) and splats.opacity_logits[0].item() == -8
+    assert (
+        torch.sigmoid(splats.opacity_logits).max().item() == pytest.approx(0.01)
+        and splats.opacity_logits[0].item() == -8
+    )
     state = optimizer.state[splats.opacity_logits]
-    assert not state["exp_avg"].any() and not state["exp_avg_sq"].any() and optimizer.state[splats.means]["exp_avg"].any()
+    assert (
+        not state["exp_avg"].any() and not state["exp_avg_sq"].any() and optimizer.state[splats.means]["exp_avg"].any()
+    )

@@ -6,8 +6,8 @@ import torch
 from test_finish import two_states
 from tiny import hinge
 
+from p2gs.gaussians.pose import carry, with_static
 from p2gs.losses.base import LOSSES, Loss
-from p2gs.models.canonical import carry, with_static
 from p2gs.models.tune import TuneConfig, tune
 from p2gs.motion.screw_polish import photometric_cost
 from p2gs.types import GaussianTensors

@@ -9,13 +9,14 @@ from tiny import photographs, textured_panels
 
 from p2gs.data.exposure import corrected
 from p2gs.data.views import TrainingViews
+from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import StateGaussians, ViewCorrections, load, save
 from p2gs.gaussians.splats import Splats
-from p2gs.models.phase import exponential
 from p2gs.models.registered import correct_views
-from p2gs.models.single_state import SingleStateConfig, SingleStatePhase, render_gaussians
+from p2gs.models.single_state import SingleStateConfig, SingleStatePhase
 from p2gs.models.view_fit import ViewErrors, ViewFitConfig, halves, measure_gains, try_cameras, try_gains
 from p2gs.ops import se3
+from p2gs.ops.decay import exponential
 from p2gs.ops.ssim import l1_ssim
 from p2gs.types import TwoStateScene
 
@@ -38,7 +39,9 @@ def moved(views, size: float, seed: int = 0):
 def exposed(views, size: float):
     gains = size * np.random.default_rng(0).normal(size=(len(views), 3))
     gains -= gains.mean(0)
-    shots = [replace(v, image=torch.from_numpy(corrected(v.image.numpy(), -g))) for v, g in zip(views, gains, strict=True)]
+    shots = [
+        replace(v, image=torch.from_numpy(corrected(v.image.numpy(), -g))) for v, g in zip(views, gains, strict=True)
+    ]
     return shots, torch.from_numpy(gains)
 
 
@@ -107,7 +110,9 @@ def test_halves(shape):
 
 def test_handed_over(tmp_path):
     g, _ = textured_panels(10)
-    given = StateGaussians(1, g, ViewCorrections(se3.exp(torch.full((2, 6), 0.01).double()), torch.tensor([[0.1, 0, -0.1]] * 2)))
+    given = StateGaussians(
+        1, g, ViewCorrections(se3.exp(torch.full((2, 6), 0.01).double()), torch.tensor([[0.1, 0, -0.1]] * 2))
+    )
     save(given, tmp_path / "s.pt")
     read = load(tmp_path / "s.pt")[0]
     assert torch.equal(read.corrections.motions, given.corrections.motions) and torch.equal(

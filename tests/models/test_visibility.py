@@ -39,6 +39,7 @@ def test_what_a_shell_encloses_is_hidden_and_the_shell_is_not():
     g = gaussians(torch.cat([shell, core]), torch.full((6050,), 0.05), 0.98)
     share = visible_share(g, ring())
     assert float(share[6000:].max()) < 0.02
-    assert float((share[:6000] > 0.1).float().mean()) > 0.3  # overlaps hide much, and the ring of cameras does not see the south
+    # overlaps hide much, and the ring of cameras does not see the south
+    assert float((share[:6000] > 0.1).float().mean()) > 0.3
     lone = visible_share(g[torch.tensor([6000])], ring())
     assert float(lone) == pytest.approx(1.0, abs=0.05)

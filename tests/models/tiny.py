@@ -29,7 +29,11 @@ def random_gaussians(n: int, seed: int = 0, degree: int = 1) -> GaussianTensors:
     sh = 0.3 * torch.randn(n, (degree + 1) ** 2, 3, generator=g)
     quats = torch.randn(n, 4, generator=g)
     return GaussianTensors(
-        torch.randn(n, 3, generator=g), quats, -3 + 0.2 * torch.randn(n, 3, generator=g), torch.randn(n, generator=g), sh
+        torch.randn(n, 3, generator=g),
+        quats,
+        -3 + 0.2 * torch.randn(n, 3, generator=g),
+        torch.randn(n, generator=g),
+        sh,
     )
 
 
@@ -40,7 +44,9 @@ def textured_panels(n: int = 600) -> tuple[GaussianTensors, torch.Tensor]:
     labels = (torch.arange(n) % 2).long()
     points[labels == 1] += torch.tensor([0.0, 0.5, 0.0])
     sh = torch.rand(n, 1, 3, generator=gen) * 3 - 1.5
-    return GaussianTensors(points, random_gaussians(n, 4).quats, torch.full((n, 3), -3.2), torch.full((n,), 3.0), sh), labels
+    return GaussianTensors(
+        points, random_gaussians(n, 4).quats, torch.full((n, 3), -3.2), torch.full((n,), 3.0), sh
+    ), labels
 
 
 def hinge() -> torch.Tensor:
@@ -75,7 +81,11 @@ def photographs(
         camera = look_at(torch.stack([3 * angle.cos(), 3 * angle.sin(), torch.tensor(1.0)]), size)
         out = rasterize(means, quats, body.scales, body.opacities, sh, camera.viewmat, camera.K, size, size)
         colour = (out.colour / out.alpha.clamp_min(1e-3)[..., None]).clamp(0, 1)
-        views.append(View(f"{state}_{k}", state, "train", camera, (colour * 255).round().byte(), (out.alpha * 255).round().byte()))
+        views.append(
+            View(
+                f"{state}_{k}", state, "train", camera, (colour * 255).round().byte(), (out.alpha * 255).round().byte()
+            )
+        )
     return views
 
 

@@ -33,7 +33,9 @@ def assert_same(a, b, optimizer_a, optimizer_b):
     for name in SHAPES:
         torch.testing.assert_close(a[name], b[name], rtol=1e-5, atol=1e-6)
         for key in ("step", "exp_avg", "exp_avg_sq"):
-            torch.testing.assert_close(optimizer_a.state[a[name]][key], optimizer_b.state[b[name]][key], rtol=1e-5, atol=1e-7)
+            torch.testing.assert_close(
+                optimizer_a.state[a[name]][key], optimizer_b.state[b[name]][key], rtol=1e-5, atol=1e-7
+            )
 
 
 def test_follows_torch(isa, threads):

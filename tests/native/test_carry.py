@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from p2gs.models.canonical import carry as carry_in_torch
-from p2gs.models.canonical import with_static
+from p2gs.gaussians.pose import carry as carry_in_torch
+from p2gs.gaussians.pose import with_static
 from p2gs.ops import se3
 from p2gs.ops.carry import Parts, RigidMoves, carry, carry_reference
 from p2gs.ops.sh import evaluate

@@ -53,7 +53,18 @@ def make_problem(n: int = 700, cells: float = 6000.0) -> Problem:
     weights = [torch.rand(len(s)) / len(s) for s in samples]
     trust = [torch.ones(n) for _ in (0, 1)]
     return Problem(
-        DiscoveryConfig(), scale, [], both, moved, static, landings, samples, weights, trust, torch.zeros(3), [~m & False for m in moved]
+        DiscoveryConfig(),
+        scale,
+        [],
+        both,
+        moved,
+        static,
+        landings,
+        samples,
+        weights,
+        trust,
+        torch.zeros(3),
+        [~m & False for m in moved],
     )
 
 
@@ -68,14 +79,20 @@ def make_motions(n: int, reach: float = 0.6) -> Motions:
 def twin(problem: Problem, motions: Motions, state: int, index, claimed=None):
     s, back = problem.surfels[state], state == 1
     x, n = motions.apply(s.points[index], back), motions.rotate(s.normals[index], back)
-    return problem.landings[1 - state].cost(x, n, s.colours[index], claimed, motions.thick[:, None].expand(x.shape[:-1]))
+    return problem.landings[1 - state].cost(
+        x, n, s.colours[index], claimed, motions.thick[:, None].expand(x.shape[:-1])
+    )
 
 
 def assert_alike(problem: Problem, motions: Motions, state: int, index, claimed=None):
     """Rounding may carry a point into the next voxel, and there it may meet another surfel."""
     cost, met = problem.cost(motions, state, index, claimed)
     expected, surfel = twin(problem, motions, state, index, claimed)
-    assert cost.dtype == torch.float32 and met.dtype == torch.int64 and cost.shape == met.shape == (len(motions), len(index))
+    assert (
+        cost.dtype == torch.float32
+        and met.dtype == torch.int64
+        and cost.shape == met.shape == (len(motions), len(index))
+    )
     same = met == surfel
     close = (cost - expected).abs() < 2e-4
     if cost.numel():
@@ -94,17 +111,23 @@ def test_landing_cost_against_torch(isa, threads, B, P, claimed):
 
 
 def test_a_plate_shows_its_other_side(isa):
-    """A slab turned half about its edge: the side that one state saw lands a thickness behind the one that the other state sees."""
+    """A slab turned half about its edge: the side that one state saw lands a thickness behind the one that the other
+    state sees."""
     g = torch.Generator().manual_seed(0)
     p = torch.rand(700, 3, generator=g) - 0.5
     front, back = p.clone(), p.clone()
     front[:, 0], back[:, 0] = -0.2, -0.24  # in free space nowhere (``NoViews`` sees x > 0.1)
     facing = torch.tensor([1.0, 0.0, 0.0]).expand(700, 3)
-    both = [Surfels(front, facing, torch.zeros(700, 3), 0.05, 0.004), Surfels(back, -facing, torch.ones(700, 3), 0.05, 0.004)]
+    both = [
+        Surfels(front, facing, torch.zeros(700, 3), 0.05, 0.004),
+        Surfels(back, -facing, torch.ones(700, 3), 0.05, 0.004),
+    ]
     lo, hi = torch.full((3,), -0.55), torch.full((3,), 0.56)
     scale, none = Scale(tau=0.02, tp=0.02, spacing=0.05, diag=1.9), torch.zeros(700, dtype=torch.bool)
     source, target = (Landing(s, none, NoViews(), lo, hi, scale, 6000.0) for s in both)
-    still = Motions(torch.ones(3, dtype=torch.bool), facing[:3], torch.zeros(3, 3), torch.zeros(3), torch.tensor([0.0, 0.04, 0.3]))
+    still = Motions(
+        torch.ones(3, dtype=torch.bool), facing[:3], torch.zeros(3, 3), torch.zeros(3), torch.tensor([0.0, 0.04, 0.3])
+    )
     cost, met = target.arrive(still, source, torch.arange(700))
     assert float((cost[0] - Landing.HIDDEN).abs().max()) < 1e-6  # who knows one side only: hidden
     assert float((cost[1] - Landing.TWO_SIDED).abs().mean()) < 0.02 and bool((met[1] >= 0).all())
@@ -115,7 +138,11 @@ def test_landing_cost_spans_its_range(isa):
     """The twins agree about something: all kinds of landings are among those compared."""
     problem = make_problem()
     cost, _ = problem.cost(make_motions(30), 0, torch.arange(700))
-    assert float(cost.min()) < 0.1 and float(cost.max()) == 1.0 and float(((cost > 0.34) & (cost < 0.36)).float().mean()) > 0.05
+    assert (
+        float(cost.min()) < 0.1
+        and float(cost.max()) == 1.0
+        and float(((cost > 0.34) & (cost < 0.36)).float().mean()) > 0.05
+    )
 
 
 @pytest.mark.parametrize("B, P", [(0, 5), (5, 0), (0, 0)])
@@ -190,7 +217,10 @@ def test_torch_takes_over_where_there_are_no_kernels(monkeypatch):
     for state in (0, 1):
         for a, b in zip(problem.cost(motions, state, index), twin(problem, motions, state, index), strict=True):
             assert torch.equal(a, b)
-    a, b = (f(problem, motions, problem.samples, problem.weights, 0.1) for f in (normal_equations, normal_equations_reference))
+    a, b = (
+        f(problem, motions, problem.samples, problem.weights, 0.1)
+        for f in (normal_equations, normal_equations_reference)
+    )
     assert torch.equal(a[0], b[0]) and torch.equal(a[1], b[1])
 
 
@@ -201,7 +231,9 @@ def test_labels_on_a_graph_against_torch(isa, threads, n, columns):
     graph = Graph(s.points, s.normals, s.colours)
     cost = torch.rand(n, columns)
     settings = dict(diffuse=8, rounds=15, pull=2.5, sharp=12.0)
-    torch.testing.assert_close(smooth_labels(cost, graph), smooth_labels_reference(cost, graph, **settings), atol=5e-5, rtol=0)
+    torch.testing.assert_close(
+        smooth_labels(cost, graph), smooth_labels_reference(cost, graph, **settings), atol=5e-5, rtol=0
+    )
     torch.testing.assert_close(graph.average(cost.double()).float(), graph.average(cost), atol=1e-6, rtol=1e-5)
 
 
@@ -245,7 +277,10 @@ def test_view_counts_against_torch(isa, threads, n):
     """Rounding may carry a point into the next pixel."""
     stack, points = make_stack(), torch.randn(n, 3)
     for views in (torch.arange(6), torch.tensor([4, 1]), torch.arange(0)):
-        got, expected = torch.stack(stack.counts(points, 0.05, views)), torch.stack(stack.counts_reference(points, 0.05, views))
+        got, expected = (
+            torch.stack(stack.counts(points, 0.05, views)),
+            torch.stack(stack.counts_reference(points, 0.05, views)),
+        )
         assert got.shape == (3, n) and got.dtype == torch.float32
         if n:
             assert int((got != expected).any(0).sum()) <= n // 500
@@ -301,10 +336,14 @@ def test_joints_against_torch(isa, threads):
     pays = [p for p, _ in problem.pay(motions)]
     pays[0][2:9], pays[1][5:12] = 0.0, 0.0
     for p, samples in ((pays, problem.samples), ([p[:, :7] for p in pays], [s[:7] for s in problem.samples])):
-        for a, b in zip(joint_sums(problem, motions, p, samples), joint_sums_reference(problem, motions, p, samples), strict=True):
+        for a, b in zip(
+            joint_sums(problem, motions, p, samples), joint_sums_reference(problem, motions, p, samples), strict=True
+        ):
             torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)
     none, nothing = [torch.zeros(0, dtype=torch.long)] * 2, [torch.zeros(33, 0)] * 2
-    for a, b in zip(joint_sums(problem, motions, nothing, none), joint_sums_reference(problem, motions, nothing, none), strict=True):
+    for a, b in zip(
+        joint_sums(problem, motions, nothing, none), joint_sums_reference(problem, motions, nothing, none), strict=True
+    ):
         assert torch.equal(a, b)
 
 
@@ -323,7 +362,9 @@ def test_effective_evidence_against_torch(isa, threads):
 
 def test_swept_distances_against_torch():
     motions, points = make_motions(30), torch.randn(120, 3)
-    torch.testing.assert_close(motions.swept(points, motions[3:9]), motions.swept_reference(points, motions[3:9]), atol=2e-6, rtol=1e-5)
+    torch.testing.assert_close(
+        motions.swept(points, motions[3:9]), motions.swept_reference(points, motions[3:9]), atol=2e-6, rtol=1e-5
+    )
     assert motions.swept(points, motions).diagonal().abs().max() < 1e-6
     assert Motions.empty().swept(points, motions).shape == (0, 30)
 

@@ -23,13 +23,16 @@ def view(seed: int, width: int = 60, height: int = 44) -> DepthView:
     depth[hole], labels[hole] = 0, -1
     K = torch.tensor([[50.0, 0, width / 2], [0, 52, height / 2], [0, 0, 1]])
     pose = se3.exp(0.1 * torch.randn(6, generator=g).double()).float()
-    return add_normals(DepthView(Camera(pose, K, width, height), depth, labels, torch.rand(height, width, 3, generator=g)), 0.1)
+    return add_normals(
+        DepthView(Camera(pose, K, width, height), depth, labels, torch.rand(height, width, 3, generator=g)), 0.1
+    )
 
 
 def setting(n: int, count: int = 5):
     views = [view(seed, 60 + seed, 44 - seed) for seed in range(count)]
     poses = [se3.exp(0.05 * torch.randn(6).double()) for _ in views]
-    points = torch.rand(n, 3) * torch.tensor([3.0, 2.4, 2.4]) - torch.tensor([1.5, 1.2, -1.0])  # some beside and behind the views
+    # some beside and behind the views
+    points = torch.rand(n, 3) * torch.tensor([3.0, 2.4, 2.4]) - torch.tensor([1.5, 1.2, -1.0])
     return points, views, [pixel_matrix(v.camera, T) for v, T in zip(views, poses, strict=True)]
 
 
@@ -41,7 +44,9 @@ def assert_follows(points, views, matrices, part):
         assert a.dtype == torch.float32 and a.shape == b.shape
         if a.numel():
             # colours of sightings that weigh next to nothing are rounded off before they are divided
-            close = torch.isclose(a.double(), b, atol=1e-3 if a.ndim == 2 else 2e-5, rtol=1e-4).reshape(len(a), -1).all(1)
+            close = (
+                torch.isclose(a.double(), b, atol=1e-3 if a.ndim == 2 else 2e-5, rtol=1e-4).reshape(len(a), -1).all(1)
+            )
             assert float(close.float().mean()) > 0.998
 
 
@@ -65,7 +70,9 @@ def test_no_views(isa):
 def test_strided_maps_are_taken(isa):
     points, views, matrices = setting(3000)
     names = ("depth", "labels", "normal_dot", "cosine", "colour")
-    turned = [replace(v, **{n: getattr(v, n).transpose(0, 1).contiguous().transpose(0, 1) for n in names}) for v in views]
+    turned = [
+        replace(v, **{n: getattr(v, n).transpose(0, 1).contiguous().transpose(0, 1) for n in names}) for v in views
+    ]
     plain, strided = (integrate(points, v, matrices, 1, TRUNC, BEHIND) for v in (views, turned))
     assert all(torch.equal(a, b) for a, b in zip(plain, strided, strict=True))
 

@@ -46,7 +46,8 @@ def test_the_twins_take_over(monkeypatch):
 
 
 def test_every_dependency_is_pinned(repo):
-    """`make setup` installs what was tested: constraints.txt has each dependency of the package and of its dev extra."""
+    """`make setup` installs what was tested: constraints.txt has each dependency of the package and of its dev
+    extra."""
 
     def plain(name):
         return re.sub(r"[-_.]+", "-", name).lower()

@@ -40,7 +40,10 @@ def test_against_all_distances(isa, threads, n, k):
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.integers(0, 2**31), st.integers(2, 400), st.sampled_from([1e-6, 1.0, 1e4]), st.sampled_from(["grid", "line", "outlier", "one place"])
+    st.integers(0, 2**31),
+    st.integers(2, 400),
+    st.sampled_from([1e-6, 1.0, 1e4]),
+    st.sampled_from(["grid", "line", "outlier", "one place"]),
 )
 def test_unkind_points(seed, n, scale, kind):
     g = torch.Generator().manual_seed(seed)

@@ -101,7 +101,9 @@ def test_environment_forces_an_instruction_set():
     def run(isa):
         code = "from p2gs.native import native; print(native.isa())"
         environment = {**os.environ, "P2GS_ISA": isa}
-        return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+        return subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120
+        )
 
     for name in native.available_isas():
         assert run(name).stdout.strip() == name

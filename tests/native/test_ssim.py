@@ -65,7 +65,11 @@ def test_ssim_agrees_with_torchmetrics():
     pred, target = pair(60, 50)
     # torchmetrics' window has 3.5 sigma to each side: sigma 1.5 gives 11 taps
     _, picture = structural_similarity_index_measure(
-        pred.permute(2, 0, 1)[None].double(), target.permute(2, 0, 1)[None].double(), sigma=1.5, data_range=1.0, return_full_image=True
+        pred.permute(2, 0, 1)[None].double(),
+        target.permute(2, 0, 1)[None].double(),
+        sigma=1.5,
+        data_range=1.0,
+        return_full_image=True,
     )
     ours = ssim_map(pred.double(), target.double())
     assert picture.shape[-2:] == (60, 50)

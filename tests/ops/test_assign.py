@@ -8,7 +8,11 @@ from p2gs.ops.assign import soft_assignment, soft_assignment_reference
 
 def setting(n=777, dim=16, parts=5, spread=1.0):
     g = torch.Generator().manual_seed(0)
-    return [spread * torch.randn(n, dim, generator=g), torch.randn(parts, dim, generator=g), torch.randn(parts, generator=g)]
+    return [
+        spread * torch.randn(n, dim, generator=g),
+        torch.randn(parts, dim, generator=g),
+        torch.randn(parts, generator=g),
+    ]
 
 
 def gradients(f, inputs, dtype, temperature):

@@ -24,7 +24,9 @@ def test_cross_entropy_follows_torch(isa, threads, shape):
     pred.flatten()[1::7] = 1  # clamped: no gradient
     ours, (grad,) = value_and_gradients(lambda p: clamped_cross_entropy(p, target, 1e-4), [pred])
     eps = float(torch.tensor(1e-4))
-    exact, (true,) = value_and_gradients(lambda p: F.binary_cross_entropy(p.clamp(eps, 1 - eps), target.double()), [pred.double()])
+    exact, (true,) = value_and_gradients(
+        lambda p: F.binary_cross_entropy(p.clamp(eps, 1 - eps), target.double()), [pred.double()]
+    )
     assert abs(ours - exact) <= 1e-5 * exact
     torch.testing.assert_close(grad.double(), true, rtol=1e-4, atol=1e-9)
     assert not grad.flatten()[::7].any()

@@ -131,5 +131,7 @@ def test_distances_and_orientation_are_kept():
     T = se3.exp(twists(10, seed=6))
     points = torch.randn(300, 3, dtype=F64)
     moved = se3.apply(T, points)
-    torch.testing.assert_close((moved[:, 1:] - moved[:, :-1]).norm(dim=-1), (points[1:] - points[:-1]).norm(dim=-1).expand(10, -1))
+    torch.testing.assert_close(
+        (moved[:, 1:] - moved[:, :-1]).norm(dim=-1), (points[1:] - points[:-1]).norm(dim=-1).expand(10, -1)
+    )
     torch.testing.assert_close(torch.linalg.det(T[:, :3, :3]), torch.ones(10, dtype=F64))

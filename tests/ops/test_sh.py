@@ -21,7 +21,8 @@ def complex_harmonic(band, m, polar, azimuth):
 
 
 def basis_naive(degree, directions):
-    """Real harmonics from scipy's complex ones (which carry the Condon-Shortley phase): sqrt(2) Im for m < 0, sqrt(2) Re for m > 0."""
+    """Real harmonics from scipy's complex ones (which carry the Condon-Shortley phase): sqrt(2) Im for m < 0, sqrt(2)
+    Re for m > 0."""
     x, y, z = directions.numpy().T
     polar, azimuth = np.arccos(z), np.arctan2(y, x)
     out = []
@@ -57,7 +58,10 @@ def test_evaluate_and_colour_round_trip():
     d = unit(5).float()
     torch.testing.assert_close(sh.evaluate(coefficients, d, degree=1), sh.evaluate(coefficients[:, :4], d))
     slow = torch.stack(
-        [0.5 + sum(basis_naive(3, d[n : n + 1].double())[0, b] * coefficients[n, b].double() for b in range(16)) for n in range(5)]
+        [
+            0.5 + sum(basis_naive(3, d[n : n + 1].double())[0, b] * coefficients[n, b].double() for b in range(16))
+            for n in range(5)
+        ]
     )
     torch.testing.assert_close(sh.evaluate(coefficients.double(), d.double()), slow, atol=1e-6, rtol=0)
 
@@ -74,7 +78,9 @@ def test_rotation_turns_the_function(degree):
 
 def test_rotation_is_a_representation_and_orthogonal():
     A, B = so3.rotvec_to_matrix(torch.randn(2, 3, dtype=F64))
-    for Ma, Mb, Mab in zip(sh.rotation_matrices(A, 3), sh.rotation_matrices(B, 3), sh.rotation_matrices(A @ B, 3), strict=True):
+    for Ma, Mb, Mab in zip(
+        sh.rotation_matrices(A, 3), sh.rotation_matrices(B, 3), sh.rotation_matrices(A @ B, 3), strict=True
+    ):
         torch.testing.assert_close(Ma @ Mb, Mab)
         torch.testing.assert_close(Ma @ Ma.T, torch.eye(len(Ma), dtype=F64), atol=1e-12, rtol=0)
 
@@ -83,7 +89,9 @@ def test_rotation_by_part_index_equals_rotation_one_by_one():
     c = torch.randn(20, 16, 3)
     R = so3.rotvec_to_matrix(torch.randn(3, 3))
     index = torch.randint(0, 3, (20,))
-    torch.testing.assert_close(sh.rotate_sh(c, R, index), torch.stack([sh.rotate_sh(c[n], R[index[n]]) for n in range(20)]))
+    torch.testing.assert_close(
+        sh.rotate_sh(c, R, index), torch.stack([sh.rotate_sh(c[n], R[index[n]]) for n in range(20)])
+    )
     torch.testing.assert_close(sh.rotate_sh(c, torch.eye(3)), c, atol=1e-5, rtol=1e-5)
 
 

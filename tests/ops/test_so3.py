@@ -31,7 +31,9 @@ def test_exp_agrees_with_scipy(dtype, tol):
 def test_log_inverts_exp_up_to_the_sign_at_pi(dtype, tol):
     w = random_rotvecs()[1:].to(dtype)
     back = so3.matrix_to_rotvec(so3.rotvec_to_matrix(w))
-    error = torch.minimum((back - w).norm(dim=-1), (back - w * (1 - 2 * math.pi / w.norm(dim=-1, keepdim=True))).norm(dim=-1))
+    error = torch.minimum(
+        (back - w).norm(dim=-1), (back - w * (1 - 2 * math.pi / w.norm(dim=-1, keepdim=True))).norm(dim=-1)
+    )
     assert error.max() < tol
     assert error.median() < tol * 1e-3
 
@@ -110,7 +112,9 @@ def test_kabsch_agrees_with_scipy_on_noisy_weighted_clouds():
     g = torch.Generator().manual_seed(4)
     src = torch.randn(50, 3, generator=g, dtype=F64)
     weights = torch.rand(3, 50, generator=g, dtype=F64)
-    dst = src @ so3.rotvec_to_matrix(torch.tensor([0.3, -2.0, 1.0], dtype=F64)).T + 0.2 * torch.randn(50, 3, generator=g, dtype=F64)
+    dst = src @ so3.rotvec_to_matrix(torch.tensor([0.3, -2.0, 1.0], dtype=F64)).T + 0.2 * torch.randn(
+        50, 3, generator=g, dtype=F64
+    )
     R, t = so3.kabsch(src, dst, weights)
     for k in range(3):
         R_slow, t_slow = kabsch_naive(src, dst, weights[k])

@@ -37,7 +37,9 @@ callbacks:
 
 
 def fit(folder: Path, *words: str, **options) -> subprocess.CompletedProcess:
-    return subprocess.run(command(folder, *words), capture_output=True, text=True, timeout=300, env=environment(), **options)
+    return subprocess.run(
+        command(folder, *words), capture_output=True, text=True, timeout=300, env=environment(), **options
+    )
 
 
 def command(folder: Path, *words: str) -> list[str]:
@@ -67,7 +69,14 @@ def test_result_folder(folder):
         assert joint["type"] in ("revolute", "prismatic") and len(joint["axis"]) == 3
         assert abs(sum(a * a for a in joint["axis"]) - 1) < 1e-6
         assert joint["limits"][0] <= joint["limits"][1] and 0 <= part["confidence"] <= 1
-    for name in ("config.yaml", "splats/canonical.ply", "splats/start.ply", "splats/end.ply", "logs/stages.json", "diagnostics.html"):
+    for name in (
+        "config.yaml",
+        "splats/canonical.ply",
+        "splats/start.ply",
+        "splats/end.ply",
+        "logs/stages.json",
+        "diagnostics.html",
+    ):
         assert (run / name).exists(), name
     assert list((run / "media").glob("*.png")) and list((run / "logs").rglob("events*"))
 
@@ -83,7 +92,9 @@ def test_a_finished_run_is_not_run_again(folder):
 def test_kill_and_go_on_gives_the_same_twin(folder, stage, tmp_path):
     """Killed as soon as the stage has a checkpoint of its own, then started again."""
     run = tmp_path / "run"
-    process = subprocess.Popen(command(folder, "--run", str(run)), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment())
+    process = subprocess.Popen(
+        command(folder, "--run", str(run)), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment()
+    )
     checkpoint = run / "checkpoints" / f"{stage}.ckpt"
     deadline = time.time() + 200
     while not checkpoint.exists() and process.poll() is None and time.time() < deadline:
@@ -98,7 +109,9 @@ def test_kill_and_go_on_gives_the_same_twin(folder, stage, tmp_path):
         assert torch.equal(a.gaussians.means, b.gaussians.means), name
     assert (run / "twin.json").read_bytes() == (folder / "whole" / "twin.json").read_bytes()
     assert (run / "splats/canonical.ply").read_bytes() == (folder / "whole" / "splats/canonical.ply").read_bytes()
-    assert json.loads((run / "diagnostics.json").read_text()) == json.loads((folder / "whole" / "diagnostics.json").read_text())
+    assert json.loads((run / "diagnostics.json").read_text()) == json.loads(
+        (folder / "whole" / "diagnostics.json").read_text()
+    )
 
 
 def test_everything_that_can_be_null(folder, tmp_path):
@@ -119,7 +132,13 @@ def test_everything_that_can_be_null(folder, tmp_path):
 
 
 def test_an_empty_reconstruction_is_told(folder, tmp_path):
-    done = fit(folder, "--run", str(tmp_path / "empty"), "--phases.single_state.steps=2", "--phases.single_state.initial_opacity=0.1")
+    done = fit(
+        folder,
+        "--run",
+        str(tmp_path / "empty"),
+        "--phases.single_state.steps=2",
+        "--phases.single_state.initial_opacity=0.1",
+    )
     assert done.returncode == 2 and "nothing opaque" in done.stderr and "Traceback" not in done.stderr, done.stderr
 
 

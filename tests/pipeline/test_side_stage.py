@@ -1,4 +1,5 @@
-"""The two single states at once, each in a process: the same bits as one after the other; an interrupt, a mistake, a lost process."""
+"""The two single states at once, each in a process: the same bits as one after the other; an interrupt, a mistake, a
+lost process."""
 
 import json
 import os
@@ -36,7 +37,20 @@ def config(folder: Path, steps: int = 60) -> Path:
 
 
 def command(config: Path, run: Path, threads: int) -> list[str]:
-    return [sys.executable, "-m", "p2gs", "fit", "-c", str(config), "--run", str(run), "--only", "single_state", "--threads", str(threads)]
+    return [
+        sys.executable,
+        "-m",
+        "p2gs",
+        "fit",
+        "-c",
+        str(config),
+        "--run",
+        str(run),
+        "--only",
+        "single_state",
+        "--threads",
+        str(threads),
+    ]
 
 
 def environment() -> dict:
@@ -46,7 +60,9 @@ def environment() -> dict:
 def test_both_states_at_once_give_the_bits_of_one_after_the_other(tmp_path):
     runs = {threads: tmp_path / str(threads) for threads in (1, 2)}
     for threads, run in runs.items():
-        done = subprocess.run(command(config(tmp_path), run, threads), capture_output=True, text=True, timeout=200, env=environment())
+        done = subprocess.run(
+            command(config(tmp_path), run, threads), capture_output=True, text=True, timeout=200, env=environment()
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         assert "single_state_1 60/60" in done.stdout  # the other process is heard
         times = json.loads((run / "logs" / "stages.json").read_text())
@@ -63,7 +79,9 @@ def test_an_interrupt_stops_both_and_keeps_what_they_have(tmp_path):
     started = command(config(tmp_path, 20000), run, 2)
     # what a script starts in the background ignores interrupts, and so would what is started here
     heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(started, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(), preexec_fn=heed)
+    process = subprocess.Popen(
+        started, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(), preexec_fn=heed
+    )
     saved = [run / "checkpoints" / f"single_state_{s}.ckpt" for s in (0, 1)]
     deadline = time.time() + 100
     while not all(p.exists() for p in saved) and process.poll() is None and time.time() < deadline:

@@ -1,4 +1,5 @@
-"""SIGTERM amid training, and two fits in one folder: what a scheduler and a hurried user do. The rest is in tests/faults."""
+"""SIGTERM amid training, and two fits in one folder: what a scheduler and a hurried user do. The rest is in
+tests/faults."""
 
 import os
 import signal
@@ -26,7 +27,20 @@ callbacks: {{checkpoint: {{every: 5}}}}
 def test_sigterm_saves_the_step_and_says_that_the_run_is_not_done(tmp_path):
     config, run = tmp_path / "states.yaml", tmp_path / "run"
     config.write_text(STATES.format(root=tmp_path / "scene"))
-    command = [sys.executable, "-m", "p2gs", "fit", "-c", str(config), "--run", str(run), "--only", "single_state", "--threads", "1"]
+    command = [
+        sys.executable,
+        "-m",
+        "p2gs",
+        "fit",
+        "-c",
+        str(config),
+        "--run",
+        str(run),
+        "--only",
+        "single_state",
+        "--threads",
+        "1",
+    ]
     environment = {**os.environ, "PYTHONPATH": str(REPO), "OMP_WAIT_POLICY": "passive"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
     saved = run / "checkpoints" / "single_state_0.ckpt"
@@ -37,7 +51,9 @@ def test_sigterm_saves_the_step_and_says_that_the_run_is_not_done(tmp_path):
         pass
     process.send_signal(signal.SIGTERM)
     said = process.communicate(timeout=200)[0]
-    assert process.returncode == 143 and "stopped; give the same command again" in said and "Traceback" not in said, said
+    assert process.returncode == 143 and "stopped; give the same command again" in said and "Traceback" not in said, (
+        said
+    )
     state = torch.load(saved, weights_only=True)
     done = state["loops"]["fit_loop"]["epoch_loop.batch_progress"]["total"]
     assert state["global_step"] == done["completed"] > 0  # between two steps
@@ -49,7 +65,9 @@ def test_a_lock_goes_with_its_process(tmp_path):
     holder = "from pathlib import Path\nfrom p2gs.run_lock import locked\n"
     holder += f"with locked(Path({str(tmp_path)!r})): print('in', flush=True); input()"
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
-    process = subprocess.Popen([sys.executable, "-c", holder], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
+    process = subprocess.Popen(
+        [sys.executable, "-c", holder], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
+    )
     assert process.stdout.readline() == b"in\n"
     with pytest.raises(UserError, match="another fit is running"), locked(tmp_path):
         pass

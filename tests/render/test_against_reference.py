@@ -25,7 +25,9 @@ def test_lower_degree_than_stored(isa):
 @pytest.mark.parametrize("features", [1, 4, 7, 16])
 @pytest.mark.parametrize("background", ["none", "constant", "image"])
 def test_features_and_background(isa, features, background):
-    assert_same_as_reference(world(features=features, background=background, bases=4, seed=features), depth_sq=features == 4, depth_ref=3.0)
+    assert_same_as_reference(
+        world(features=features, background=background, bases=4, seed=features), depth_sq=features == 4, depth_ref=3.0
+    )
 
 
 def test_absolute_gradient_of_centres(isa):
@@ -54,7 +56,9 @@ def test_features_without_gradient():
 
 def test_opaque_and_nearly_transparent(isa):
     # pixels finish early; 1 - 0.99 costs float32 two digits of the transmittance
-    assert_same_as_reference(world(1500, opacity=(0.97, 1.0), scale=(0.03, 0.2), seed=8, background="image"), tolerance=3e-5)
+    assert_same_as_reference(
+        world(1500, opacity=(0.97, 1.0), scale=(0.03, 0.2), seed=8, background="image"), tolerance=3e-5
+    )
     assert_same_as_reference(world(400, opacity=(1 / 255, 0.02), seed=9, background="constant"))
 
 
@@ -98,7 +102,9 @@ def test_radii_and_visibility():
     want, got = (w.render(b, d, grad=False)[0].radii for b, d in (("torch_ref", torch.float64), ("cpu", torch.float32)))
     seen = (want > 0) & (got > 0)
     assert seen.sum() > 50 and torch.equal(want[seen], got[seen])
-    assert not ((want == 0) & (got > 0)).any()  # the native one knows the ellipse, the reference its box: it may cull more
+    assert not (
+        (want == 0) & (got > 0)
+    ).any()  # the native one knows the ellipse, the reference its box: it may cull more
 
 
 def test_many_tiles(isa):
@@ -116,7 +122,9 @@ needs_native = pytest.mark.skipif(native is None, reason="p2gs was installed wit
     background=st.sampled_from(["none", "constant", "image"]), scale=st.floats(0.005, 1.5), depth_sq=st.booleans(), seed=st.integers(0, 99),
 )  # fmt: skip
 def test_any_size(n, width, height, features, background, scale, depth_sq, seed):
-    w = world(n, width, height, features=features, background=background, bases=4, scale=(0.3 * scale, scale), seed=seed)
+    w = world(
+        n, width, height, features=features, background=background, bases=4, scale=(0.3 * scale, scale), seed=seed
+    )
     want, x = w.render("torch_ref", torch.float64, depth_sq=depth_sq)
     got, y = w.render("cpu", torch.float32, depth_sq=depth_sq)
     assert torch.allclose(got.colour.double(), want.colour, atol=2e-5)

@@ -1,4 +1,5 @@
-"""The gradient by world -> camera: the reference against finite differences, the backends against the reference, a camera found again."""
+"""The gradient by world -> camera: the reference against finite differences, the backends against the reference, a
+camera found again."""
 
 import pytest
 import torch
@@ -13,12 +14,16 @@ def rendered(w, backend: str, dtype: torch.dtype, viewmat, **options):
     """Only the camera is a leaf, in ``dtype``."""
     camera = viewmat.to(dtype).clone().requires_grad_()
     leaves = {k: t.to(dtype) for k, t in w.tensors.items() if t is not None}
-    return rasterize(viewmat=camera, K=w.K, width=w.width, height=w.height, backend=backend, **leaves, **options), {"viewmat": camera}
+    return rasterize(viewmat=camera, K=w.K, width=w.width, height=w.height, backend=backend, **leaves, **options), {
+        "viewmat": camera
+    }
 
 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gradcheck(antialias):
-    w = world(4, 6, 5, bases=16, features=2, background="image", opacity=(0.3, 0.9), scale=(0.3, 0.6), spread=0.3, seed=1)
+    w = world(
+        4, 6, 5, bases=16, features=2, background="image", opacity=(0.3, 0.9), scale=(0.3, 0.6), spread=0.3, seed=1
+    )
     given = {k: t for k, t in w.tensors.items() if t is not None}
 
     def f(rows):
@@ -75,7 +80,11 @@ def test_a_turned_camera_is_found_again(isa):
     for step in range(120):
         optimizer.param_groups[0]["lr"] = 2e-3 * 0.01 ** (step / 120)
         viewmat = (se3.exp(twist) @ guess).float()
-        loss = (rasterize(viewmat=viewmat, K=w.K, width=w.width, height=w.height, backend="cpu", **tensors).colour - photo).abs().mean()
+        loss = (
+            (rasterize(viewmat=viewmat, K=w.K, width=w.width, height=w.height, backend="cpu", **tensors).colour - photo)
+            .abs()
+            .mean()
+        )
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

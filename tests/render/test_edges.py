@@ -35,7 +35,9 @@ def test_pixels_by_name_are_the_options_they_stand_for(backend):
     w = world(50, 20, 16, seed=3)
     colour = {p: w.render(f"{backend}:{p}", torch.float32)[0].colour for p in PIXELS}
     for name, pixels in PIXELS.items():
-        assert torch.equal(colour[name], w.render(backend, torch.float32, eps2d=pixels.eps2d, antialias=pixels.antialias)[0].colour)
+        assert torch.equal(
+            colour[name], w.render(backend, torch.float32, eps2d=pixels.eps2d, antialias=pixels.antialias)[0].colour
+        )
     assert torch.equal(colour["classic"], w.render(backend, torch.float32)[0].colour)
     assert not torch.equal(colour["classic"], colour["sharp"])
 
@@ -148,7 +150,9 @@ def test_same_bits_for_any_number_of_threads(isa, n, scale):
         torch.set_num_threads(count)
         out, leaves = w.render("cpu", torch.float32, depth_sq=True, absgrad=True)
         gradients = backward(out, leaves)
-        results.append([out.colour, out.depth, out.depth_sq, out.alpha, out.features, out.means2d_abs_grad, *gradients.values()])
+        results.append(
+            [out.colour, out.depth, out.depth_sq, out.alpha, out.features, out.means2d_abs_grad, *gradients.values()]
+        )
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
@@ -193,5 +197,10 @@ def test_slow_reference_says_so_once():
 
 
 def test_unknown_isa_is_told():
-    run = subprocess.run([sys.executable, "-c", "import p2gs.render"], env={"P2GS_ISA": "avx9", "PATH": ""}, capture_output=True, text=True)
+    run = subprocess.run(
+        [sys.executable, "-c", "import p2gs.render"],
+        env={"P2GS_ISA": "avx9", "PATH": ""},
+        capture_output=True,
+        text=True,
+    )
     assert native is None or "P2GS_ISA=avx9 is not among" in run.stderr

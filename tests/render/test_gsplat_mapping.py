@@ -1,4 +1,5 @@
-"""Our arguments onto gsplat's and its results back, with a stand-in for gsplat that has its documented behaviour (no CUDA needed)."""
+"""Our arguments onto gsplat's and its results back, with a stand-in for gsplat that has its documented behaviour (no
+CUDA needed)."""
 
 import importlib
 import sys
@@ -12,9 +13,25 @@ from p2gs.render import base
 
 
 def _rasterization(
-    *, means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, eps2d, packed, absgrad, rasterize_mode
+    *,
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmats,
+    Ks,
+    width,
+    height,
+    near_plane,
+    far_plane,
+    eps2d,
+    packed,
+    absgrad,
+    rasterize_mode,
 ):
-    """gsplat.rasterization for one camera and post-activation colours of any number of channels, by way of the torch reference."""
+    """gsplat.rasterization for one camera and post-activation colours of any number of channels, by way of the torch
+    reference."""
     from p2gs.render.torch_ref import rasterize_torch
 
     assert viewmats.shape == (1, 4, 4) and Ks.shape == (1, 3, 3) and not packed and far_plane == 1e10
@@ -28,7 +45,11 @@ def _rasterization(
     means2d = means[None, :, :2] * 1.0
     means2d.absgrad = torch.tensor([[[3.0, 4.0]]]).expand(1, n, 2)
     image = out.features + 0 * means2d.sum()
-    return image[None], out.alpha[None, ..., None], {"radii": out.radii[None, :, None].expand(1, n, 2), "means2d": means2d}
+    return (
+        image[None],
+        out.alpha[None, ..., None],
+        {"radii": out.radii[None, :, None].expand(1, n, 2), "means2d": means2d},
+    )
 
 
 @contextmanager

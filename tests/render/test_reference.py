@@ -12,7 +12,9 @@ from p2gs.render import rasterize
 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gradcheck(antialias):
-    w = world(4, 6, 5, bases=4, features=2, background="image", opacity=(0.3, 0.9), scale=(0.3, 0.6), spread=0.3, seed=1)
+    w = world(
+        4, 6, 5, bases=4, features=2, background="image", opacity=(0.3, 0.9), scale=(0.3, 0.6), spread=0.3, seed=1
+    )
     names = [k for k, t in w.tensors.items() if t is not None]
 
     def f(*tensors):
@@ -40,7 +42,19 @@ def test_two_gaussians_by_hand():
     means, quats, scales, opacities, sh, colours, K = _two_on_the_axis()
     background = torch.tensor([0.0, 1, 0], dtype=torch.float64)
     out = rasterize(
-        means, quats, scales, opacities, sh, torch.eye(4), K, 1, 1, background=background, depth_sq=True, depth_ref=1.0, backend="torch_ref"
+        means,
+        quats,
+        scales,
+        opacities,
+        sh,
+        torch.eye(4),
+        K,
+        1,
+        1,
+        background=background,
+        depth_sq=True,
+        depth_ref=1.0,
+        backend="torch_ref",
     )
     near, far = 0.4, 0.6 * 0.7
     assert torch.allclose(out.colour[0, 0], near * colours[1] + far * colours[0] + (1 - near - far) * background)
@@ -62,12 +76,29 @@ def test_footprint_by_hand():
 
 @pytest.mark.parametrize("tilt", [0.0, 0.8, 1.3])
 def test_antialiased_area(tilt):
-    """Opacity falls as the area grows: a disc covers what its projection covers, also when it is seen almost edge-on."""
+    """Opacity falls as the area grows: a disc covers what its projection covers, also when it is seen almost
+    edge-on."""
     quats = torch.tensor([[math.cos(tilt / 2), math.sin(tilt / 2), 0, 0]], dtype=torch.float64)
     K = torch.tensor([[200.0, 0, 50.5], [0, 200, 50.5], [0, 0, 1]])
-    means, scales, opacity = torch.tensor([[0.0, 0, 4]]).double(), torch.tensor([[0.01, 0.01, 1e-5]]).double(), torch.tensor([0.9]).double()
+    means, scales, opacity = (
+        torch.tensor([[0.0, 0, 4]]).double(),
+        torch.tensor([[0.01, 0.01, 1e-5]]).double(),
+        torch.tensor([0.9]).double(),
+    )
     out = [
-        rasterize(means, quats, scales, opacity, torch.zeros(1, 1, 3), torch.eye(4), K, 101, 101, backend="torch_ref", **options)
+        rasterize(
+            means,
+            quats,
+            scales,
+            opacity,
+            torch.zeros(1, 1, 3),
+            torch.eye(4),
+            K,
+            101,
+            101,
+            backend="torch_ref",
+            **options,
+        )
         for options in ({"eps2d": 0.1, "antialias": True}, {"eps2d": 0.3, "antialias": True}, {"eps2d": 0.3})
     ]
     true = 0.9 * 2 * math.pi * (200 * 0.01 / 4) ** 2 * math.cos(tilt)
@@ -85,6 +116,7 @@ def test_scaled_and_cropped_cameras():
     K[0, 2] -= 13
     K[1, 2] -= 9
     crop = rasterize(viewmat=w.viewmat, K=K, width=25, height=21, backend="torch_ref", **x)
-    # small splats near the axis: the Jacobian's clamp, which depends on the window, moves none of those that reach into it much
+    # small splats near the axis: the Jacobian's clamp, which depends on the window, moves none of those that reach into
+    # it much
     assert torch.allclose(whole.colour[9:30, 13:38], crop.colour, atol=1e-3)
     assert (whole.alpha[9:30, 13:38] > 0.5).any()

@@ -4,8 +4,8 @@ import pytest
 import torch
 from worlds import backward, relative_error, world
 
+from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.splats import Splats
-from p2gs.models.single_state import render_gaussians
 from p2gs.render import RASTERIZERS, rasterize_stored
 from p2gs.types import Camera, GaussianTensors
 
@@ -17,12 +17,20 @@ def stored(w, split):
     t = w.tensors
     sh = {"sh": t["sh"][:, :1], "sh_rest": t["sh"][:, 1:]} if split else {"sh": t["sh"], "sh_rest": None}
     opacity = t["opacities"].clamp(1e-3, 1 - 1e-3)
-    return {"means": t["means"], "quats": t["quats"], "log_scales": t["scales"].log(), "opacity_logits": opacity.logit(), **sh}
+    return {
+        "means": t["means"],
+        "quats": t["quats"],
+        "log_scales": t["scales"].log(),
+        "opacity_logits": opacity.logit(),
+        **sh,
+    }
 
 
 def rendered(w, split, backend, dtype, **options):
     given = {k: v if v is None else v.float().to(dtype).clone().requires_grad_() for k, v in stored(w, split).items()}
-    out = rasterize_stored(**given, viewmat=w.viewmat, K=w.K, width=w.width, height=w.height, backend=backend, depth_sq=True, **options)
+    out = rasterize_stored(
+        **given, viewmat=w.viewmat, K=w.K, width=w.width, height=w.height, backend=backend, depth_sq=True, **options
+    )
     return out, {k: v for k, v in given.items() if v is not None}
 
 

@@ -17,7 +17,8 @@ INPUTS = ("means", "quats", "scales", "opacities", "sh", "features", "background
 
 @dataclass
 class World:
-    """Arguments of ``rasterize``: float64 tensors whose values are float32 numbers, so that both precisions see the same scene."""
+    """Arguments of ``rasterize``: float64 tensors whose values are float32 numbers, so that both precisions see the
+    same scene."""
 
     tensors: dict[str, Optional[Tensor]]
     viewmat: Tensor
@@ -25,9 +26,13 @@ class World:
     width: int
     height: int
 
-    def render(self, backend: str, dtype: torch.dtype, grad: bool = True, **options) -> tuple[RenderOutput, dict[str, Tensor]]:
+    def render(
+        self, backend: str, dtype: torch.dtype, grad: bool = True, **options
+    ) -> tuple[RenderOutput, dict[str, Tensor]]:
         leaves = {k: t.to(dtype).clone().requires_grad_(grad) for k, t in self.tensors.items() if t is not None}
-        out = rasterize(viewmat=self.viewmat, K=self.K, width=self.width, height=self.height, backend=backend, **leaves, **options)
+        out = rasterize(
+            viewmat=self.viewmat, K=self.K, width=self.width, height=self.height, backend=backend, **leaves, **options
+        )
         return out, leaves
 
 
@@ -60,7 +65,9 @@ def world(
         "opacities": uniform(*opacity, n),
         "sh": (normal(n, bases, 3) * 0.3).float().double(),
         "features": normal(n, features) if features else None,
-        "background": {"none": None, "constant": uniform(0, 1, 3), "image": uniform(0, 1, height, width, 3)}[background],
+        "background": {"none": None, "constant": uniform(0, 1, 3), "image": uniform(0, 1, height, width, 3)}[
+            background
+        ],
     }
     viewmat = torch.eye(4)
     axis = torch.linalg.qr(torch.randn(3, 3, generator=g, dtype=torch.float64))[0]
@@ -70,7 +77,9 @@ def world(
     return World(tensors, viewmat, K, width, height)
 
 
-def backward(out: RenderOutput, leaves: dict[str, Tensor], seed: int = 1, outputs: tuple[str, ...] = OUTPUTS) -> dict[str, Tensor]:
+def backward(
+    out: RenderOutput, leaves: dict[str, Tensor], seed: int = 1, outputs: tuple[str, ...] = OUTPUTS
+) -> dict[str, Tensor]:
     """Gradients of a random linear function of the named outputs."""
     g = torch.Generator().manual_seed(seed)
     loss = 0.0

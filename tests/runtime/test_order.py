@@ -32,7 +32,9 @@ def phases(monkeypatch):
 
 
 def run(*stages, options=None):
-    return SimpleNamespace(cfg=SimpleNamespace(stages=list(stages), phases=dict.fromkeys(stages if options is None else options)))
+    return SimpleNamespace(
+        cfg=SimpleNamespace(stages=list(stages), phases=dict.fromkeys(stages if options is None else options))
+    )
 
 
 def test_the_order_is_the_configs(phases):

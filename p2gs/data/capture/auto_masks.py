@@ -1,4 +1,5 @@
-"""Masks from 3D: the object's Gaussians of a coarse splat drawn into every photograph, their edge sharpened in the photograph."""
+"""Masks from 3D: the object's Gaussians of a coarse splat drawn into every photograph, their edge sharpened in the
+photograph."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from p2gs.types import Camera, UserError
 COARSE = 200  # px, long edge of the splat's pictures
 SHARP = 480  # px, long edge that edges are sharpened at
 BAND = 0.012  # of the long edge, to either side of the drawn edge: two pixels of the splat's pictures
-IN_HULL = 0.93  # share of the photographs that must show a point within the outline; a ragged coarse outline misses some at its edge
+# share of the photographs that must show a point within the outline; a ragged coarse outline misses some at its edge
+IN_HULL = 0.93
 PORE = 0.03  # of the mask: smaller holes are the coarse splat's, where a plain side gave it nothing to hold on to
 CHANGED = 0.15  # share of the mask that sharpening may change before it is not believed
 
@@ -43,7 +45,8 @@ def pictures_of(model: Model, photos: Path, gains: dict[int, np.ndarray], keys: 
 
 
 def sharpened(image: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """[h, w] bool: the object by GrabCut in a band around the edge of ``share`` [h, w] float (what the splat says). image: uint8 RGB."""
+    """[h, w] bool: the object by GrabCut in a band around the edge of ``share`` [h, w] float (what the splat says).
+    image: uint8 RGB."""
     import cv2
 
     drawn = (share > 0.5).astype(np.uint8)
@@ -82,8 +85,8 @@ def without_pores(mask: np.ndarray) -> np.ndarray:
 def enclosed(splat, rows: torch.Tensor, pictures: list[Picture], region: Region) -> torch.Tensor:
     """[N] bool: Gaussians that no photograph shows beside the object, though they are none of its body's.
 
-    A dark inside without texture is explained by floor and wall behind it, which nobody sees from elsewhere: what lies in the hull of the
-    body's outlines is the object's (Laurentini 1994, doi:10.1109/34.273735).
+    A dark inside without texture is explained by floor and wall behind it, which nobody sees from elsewhere: what lies
+    in the hull of the body's outlines is the object's (Laurentini 1994, doi:10.1109/34.273735).
     """
     from scipy.ndimage import binary_fill_holes
 

@@ -1,7 +1,7 @@
 """The printed marker board: a PDF to print, its corners in photographs, what they say about scale and up.
 
-4 x 3 ArUco markers (dictionary 4X4_50, ids 0 to 11) of 40 mm, 10 mm apart, on A4 across. The board lies flat on the floor and stays
-there while the parts are moved.
+4 x 3 ArUco markers (dictionary 4X4_50, ids 0 to 11) of 40 mm, 10 mm apart, on A4 across. The board lies flat on the
+floor and stays there while the parts are moved.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ COLUMNS, ROWS, MARKER, GAP = 4, 3, 0.040, 0.010  # metres
 DPI = 300
 MIN_CORNERS = 8  # two markers: one alone fixes the scale to a per cent at best
 FITS = 0.05  # rms of the corners over the board's diagonal: more and the sheet was not flat, or is another board
-SMALL = 2400  # px: smaller photographs are enlarged before markers are sought, which are a dozen pixels wide from across a room
+# px: smaller photographs are enlarged before markers are sought, which are a dozen pixels wide from across a room
+SMALL = 2400
 MIN_SIGHTINGS = 4  # markers over all photographs: textures that look like one do so once
 
 
@@ -74,7 +75,8 @@ def write_board(path: Path) -> None:
 def find_markers(path: Path, mirrored: bool = False) -> dict[int, np.ndarray]:
     """Marker id -> [4, 2] corners in pixels (centres at +0.5) of the board's markers in a photograph.
 
-    mirrored: of a sheet printed (or rendered) mirror-wise; a plane turned over has the same corners, so nothing else changes.
+    mirrored: of a sheet printed (or rendered) mirror-wise; a plane turned over has the same corners, so nothing else
+    changes.
     """
     import cv2
 
@@ -98,7 +100,8 @@ def find_markers(path: Path, mirrored: bool = False) -> dict[int, np.ndarray]:
 
 
 def find_board(names: list[str], folder: Path) -> dict[str, dict[int, np.ndarray]]:
-    """Photograph's name -> its markers, of the photographs that show any; read as they are or mirror-wise, whichever finds more."""
+    """Photograph's name -> its markers, of the photographs that show any; read as they are or mirror-wise, whichever
+    finds more."""
     best: dict[str, dict[int, np.ndarray]] = {}
     for mirrored in (False, True):
         seen = {name: markers for name in names if (markers := find_markers(folder / name, mirrored))}
@@ -147,7 +150,8 @@ def with_corners(model: Model, seen: dict[str, dict[int, np.ndarray]]) -> tuple[
 
 
 def _meet(rays: list) -> np.ndarray | None:
-    """The point nearest to rays [(_, origin, direction, _)], robust to one that is off; None where they do not fix one."""
+    """The point nearest to rays [(_, origin, direction, _)], robust to one that is off; None where they do not fix
+    one."""
     weight = np.ones(len(rays))
     origins, directions = np.array([r[1] for r in rays]), np.array([r[2] for r in rays])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -163,7 +167,8 @@ def _meet(rays: list) -> np.ndarray | None:
 
 
 def board_pose(model: Model, points: dict[int, int]) -> tuple[np.ndarray, float] | None:
-    """([4, 4] similarity metres -> model, weighted rms in metres) of the board; None where too few markers are whole or they do not fit."""
+    """([4, 4] similarity metres -> model, weighted rms in metres) of the board; None where too few markers are whole or
+    they do not fit."""
     known, there = template(), set(model.ids.tolist())
     whole = [m for m in known if all(points.get(corner_id(m, c)) in there for c in range(4))]
     if 4 * len(whole) < MIN_CORNERS:
@@ -186,7 +191,8 @@ def board_pose(model: Model, points: dict[int, int]) -> tuple[np.ndarray, float]
 
 
 def board_similarity(start: Model, end: Model, seen: dict[str, dict[int, np.ndarray]]) -> np.ndarray | None:
-    """[4, 4] similarity start -> end by the board's corners in each state's own model; None where it was not seen in both."""
+    """[4, 4] similarity start -> end by the board's corners in each state's own model; None where it was not seen in
+    both."""
     found = []
     for model in (start, end):
         grown, points = with_corners(model, seen)

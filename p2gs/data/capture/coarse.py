@@ -1,8 +1,9 @@
 """A coarse splat of the whole scene in one state, and which of its Gaussians are the object.
 
-Gaussians start as a cloud around the point that the cameras look at, as a grid on the floor and on walls behind, and at the points of the
-model. After a few hundred steps the cloud's opaque ones are cut off floor and walls and joined to bodies; the body that the cameras look at
-is the object. Multi-view consistent by construction, and it needs no network that would have to know what a cupboard is.
+Gaussians start as a cloud around the point that the cameras look at, as a grid on the floor and on walls behind, and at
+the points of the model. After a few hundred steps the cloud's opaque ones are cut off floor and walls and joined to
+bodies; the body that the cameras look at is the object. Multi-view consistent by construction, and it needs no network
+that would have to know what a cupboard is.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """COLMAP's sparse models on disk, binary and text: ``cameras``, ``images``, ``points3D``. Needs numpy alone.
 
-Format: COLMAP, doc/format.rst. The ``rigs`` and ``frames`` that COLMAP 4 writes beside them repeat the poses of single cameras and are
-not needed; a rig of several cameras is read through its images as well.
+Format: COLMAP, doc/format.rst. The ``rigs`` and ``frames`` that COLMAP 4 writes beside them repeat the poses of single
+cameras and are not needed; a rig of several cameras is read through its images as well.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ MODEL_IDS = {name: i for i, name in MODEL_NAMES.items()}
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder that holds ``cameras.bin`` or ``.txt``: the one given, its ``sparse``, ``sparse/0`` or ``colmap/sparse/0``."""
+    """The folder that holds ``cameras.bin`` or ``.txt``: the one given, its ``sparse``, ``sparse/0`` or
+    ``colmap/sparse/0``."""
     for part in ("", "sparse", "sparse/0", "colmap/sparse/0", "0"):
         for suffix in (".bin", ".txt"):
             if (folder / part / f"cameras{suffix}").is_file():
@@ -157,9 +158,8 @@ def _images_txt(path: Path) -> dict[int, Photo]:
     lines, out = _lines(path), {}
     while lines and not lines[0].strip():
         lines.pop(0)
-    for head, tail in zip(
-        lines[::2], [*lines[1::2], ""], strict=False
-    ):  # an image without points has an empty second line
+    # an image without points has an empty second line
+    for head, tail in zip(lines[::2], [*lines[1::2], ""], strict=False):
         words = head.split(maxsplit=9)
         numbers = np.array(tail.split(), float).reshape(-1, 3)
         viewmat = _viewmat([float(w) for w in words[1:5]], [float(w) for w in words[5:8]])

@@ -16,7 +16,8 @@ MIN_SHARE = 0.08  # of the points: less is no floor
 
 @dataclass(frozen=True)
 class Floor:
-    """Points x of the floor: normal . x = height, normal [3] pointing up.  source: board, floor plane, or cameras (no floor found)."""
+    """Points x of the floor: normal . x = height, normal [3] pointing up.  source: board, floor plane, or cameras (no
+    floor found)."""
 
     normal: np.ndarray
     height: float

@@ -1,8 +1,9 @@
-"""Exposure and white balance of each photograph against the others, from the colours of points that several of them show.
+"""Exposure and white balance of each photograph against the others, from the colours of points that several of them
+show.
 
-In linear light a photograph is the scene times three numbers (exposure and white balance, red, green, blue). Their logarithms have mean
-zero over all photographs of both states, so that the correction has no colour of its own. The moving parts' points are few and the
-estimate is a median, so they do not pull it.
+In linear light a photograph is the scene times three numbers (exposure and white balance, red, green, blue). Their
+logarithms have mean zero over all photographs of both states, so that the correction has no colour of its own. The
+moving parts' points are few and the estimate is a median, so they do not pull it.
 """
 
 from __future__ import annotations

@@ -16,7 +16,8 @@ STATES = ("start", "end")
 def mask_file(folder: Path, shot: Shot) -> Path:
     """The mask of a photograph: ``DIR/start/IMG_1.png``, ``IMG_1.jpg.png`` and the like, or the same below DIR itself.
 
-    Raises UserError naming the photograph where there is none, or where both states' photographs share a name in one folder.
+    Raises UserError naming the photograph where there is none, or where both states' photographs share a name in one
+    folder.
     """
     state, stem = shot.name.split("/")[0], Path(shot.source).stem
     for base in (folder / state, folder):
@@ -27,9 +28,11 @@ def mask_file(folder: Path, shot: Shot) -> Path:
 
 
 def read_mask(path: Path, shot: Shot, ignore: bool) -> np.ndarray:
-    """[H, W] uint8 in the size of the photograph's copy. ignore: nerfstudio's meaning, black is what is not to be looked at.
+    """[H, W] uint8 in the size of the photograph's copy. ignore: nerfstudio's meaning, black is what is not to be
+    looked at.
 
-    Both meanings show the object white; with ``ignore`` an alpha channel is not asked. Raises UserError for another shape.
+    Both meanings show the object white; with ``ignore`` an alpha channel is not asked. Raises UserError for another
+    shape.
     """
     import cv2
 
@@ -67,7 +70,8 @@ def alpha_masks(shots: list[Shot], folder: Path) -> dict[str, np.ndarray] | None
 def folder_masks(shots: list[Shot], folder: Path, ignore: bool = False) -> dict[str, np.ndarray]:
     """The masks in a folder by photograph's name. Raises UserError where a file is missing.
 
-    A mask without a white pixel says that its photograph does not show the object: it helps to place the others and is not trained on.
+    A mask without a white pixel says that its photograph does not show the object: it helps to place the others and is
+    not trained on.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: there is no such folder of masks")

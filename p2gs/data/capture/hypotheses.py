@@ -1,8 +1,10 @@
-"""How the end state's reconstruction lies to the start state's: every rigid thing that both show votes for a similarity.
+"""How the end state's reconstruction lies to the start state's: every rigid thing that both show votes for a
+similarity.
 
-The room votes for one, each part that moved for another. Which is the room's? Not the one with the most votes: a textured drawer front in
-front of a plain wall has nearly all of them, and fastening the open state to it looks perfect in every photograph. It is the one whose
-support is widest in space. Where none is wide the capture cannot be used, and this module says so.
+The room votes for one, each part that moved for another. Which is the room's? Not the one with the most votes: a
+textured drawer front in front of a plain wall has nearly all of them, and fastening the open state to it looks perfect
+in every photograph. It is the one whose support is widest in space. Where none is wide the capture cannot be used, and
+this module says so.
 """
 
 from __future__ import annotations
@@ -15,11 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from p2gs.data.capture.model import Model, similarity
 
-RATIO = (
-    0.9  # nearest to second-nearest distance of mean descriptors; they are more alike than single ones, hence not 0.8
-)
+# nearest to second-nearest distance of mean descriptors; they are more alike than single ones, hence not 0.8
+RATIO = 0.9
 MAX_COSINE_GAP = 0.25  # 1 - cosine of two descriptors of one thing
-INLIER = 0.008  # reprojection error of a vote as a share of the image's long edge: two reconstructions' points agree to about 8 mm at 1 m
+# reprojection error of a vote as a share of the image's long edge: two reconstructions' points agree to about 8 mm at 1
+# m
+INLIER = 0.008
 MIN_VOTES = 12  # a similarity has 7 unknowns, 3 votes fix it; chance reached 8 in rooms without common texture
 MAX_HYPOTHESES = 6
 TRIALS = 1500  # samples of three: finds a group of a seventh of the votes with 98 %
@@ -41,8 +44,8 @@ class State:
 class Hypothesis:
     """T: [4, 4] similarity start -> end.  pairs: [n, 2] rows of start's and end's points that support it.
 
-    spread: how far the support reaches about its median, root mean square over the cameras' distance.  outside: share of it outside the
-    object's ball.  board: whether the marker board says the same (None without one).
+    spread: how far the support reaches about its median, root mean square over the cameras' distance.  outside: share
+    of it outside the object's ball.  board: whether the marker board says the same (None without one).
     """
 
     T: np.ndarray
@@ -91,7 +94,8 @@ def match_descriptors(a: np.ndarray, b: np.ndarray, chunk: int = 2000) -> np.nda
 
 
 class Sightings:
-    """One sighting of each point: its camera [P, 3, 4], the ray it was seen along [P, 2], the focal length over the long edge [P]."""
+    """One sighting of each point: its camera [P, 3, 4], the ray it was seen along [P, 2], the focal length over the
+    long edge [P]."""
 
     def __init__(self, model: Model):
         rows, images, pixels = model.observations()
@@ -112,7 +116,8 @@ class Sightings:
             self.ray[mine] = lens.rays(pixels[middle[mine]])
 
     def residuals(self, rows: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """[n, 2] reprojection errors of points [n, 3] where the points of ``rows`` were seen, over the long edge; 1 behind the camera."""
+        """[n, 2] reprojection errors of points [n, 3] where the points of ``rows`` were seen, over the long edge; 1
+        behind the camera."""
         C = self.camera[rows]
         local = np.einsum("nij,nj->ni", C[:, :, :3], points) + C[:, :, 3]
         front = local[:, 2] > 1e-9

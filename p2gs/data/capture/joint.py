@@ -1,7 +1,9 @@
-"""Both states in one model: points of the static scene that both show become one point, and everything is adjusted together.
+"""Both states in one model: points of the static scene that both show become one point, and everything is adjusted
+together.
 
-Points are matched between the two reconstructions, not between photographs: with the static hypothesis known, two points are one where
-each projects to where the other was seen and their descriptors agree. That costs a second where 60 x 60 pairs of photographs cost minutes.
+Points are matched between the two reconstructions, not between photographs: with the static hypothesis known, two
+points are one where each projects to where the other was seen and their descriptors agree. That costs a second where 60
+x 60 pairs of photographs cost minutes.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from p2gs.data.capture.hypotheses import State, Votes
 from p2gs.data.capture.model import Model, similarity
 from p2gs.ops.knn import search_tree
 
-GUIDED = 0.004  # reprojection error over the long edge for points found with the hypothesis known: half of what a vote may have
+# reprojection error over the long edge for points found with the hypothesis known: half of what a vote may have
+GUIDED = 0.004
 NEAR = 0.03  # two reconstructions of one point differ by less than this share of the cameras' distance
 ALIKE = 0.8  # cosine of the mean descriptors of one point seen in both states
 MAX_ERROR = 3.0  # pixels: an observation worse than this is a wrong match; good ones are at 0.5 to 0.8
@@ -30,7 +33,8 @@ ROUNDS = 2  # match, adjust; with the better poses once more
 class Bias:
     """How far the states are apart after adjustment, by static points triangulated from each state alone.
 
-    shift: at the object's centre, in the model's units.  turn: degrees.  points: how many say so.  share: of all points.
+    shift: at the object's centre, in the model's units.  turn: degrees.  points: how many say so.  share: of all
+    points.
     """
 
     shift: float
@@ -96,7 +100,8 @@ def merged(start: Model, end: Model, T: np.ndarray, pairs: np.ndarray) -> Model:
 
 
 def filtered(model: Model, max_error: float = MAX_ERROR) -> Model:
-    """The model without observations worse than ``max_error`` pixels and points that fewer than two photographs are left for."""
+    """The model without observations worse than ``max_error`` pixels and points that fewer than two photographs are
+    left for."""
     rows, _, error = model.errors()
     good = error <= max_error
     counts = np.bincount(rows[good], minlength=len(model.ids))
@@ -139,7 +144,8 @@ def join(
 ) -> Model:
     """One adjusted model of both states in the start's frame.
 
-    T: [4, 4] static similarity start -> end.  extra: function that adds tracks of its own to the merged model (marker corners), or None.
+    T: [4, 4] static similarity start -> end.  extra: function that adds tracks of its own to the merged model (marker
+    corners), or None.
     """
     model = None
     for turn in range(ROUNDS):
@@ -182,7 +188,8 @@ def _relative(model: Model, start: Model, end: Model) -> np.ndarray:
 
 
 def triangulated(model: Model, end: bool) -> tuple[np.ndarray, np.ndarray]:
-    """(points [P, 3], count [P]) from one state's photographs alone: nearest to all rays of each point; NaN below two rays."""
+    """(points [P, 3], count [P]) from one state's photographs alone: nearest to all rays of each point; NaN below two
+    rays."""
     A, b, count = np.zeros((len(model.ids), 3, 3)), np.zeros((len(model.ids), 3)), np.zeros(len(model.ids), int)
     for photo in model.photos.values():
         if is_end(photo.name) != end:

@@ -1,7 +1,7 @@
 """A structure-from-motion model in plain numpy: lenses, posed photographs, points with tracks.
 
-Cameras are OpenCV, world to camera; image coordinates have their origin in the corner of the first pixel (its centre is at +0.5), as in
-COLMAP. Reading and writing of COLMAP's files is in ``colmap_io``.
+Cameras are OpenCV, world to camera; image coordinates have their origin in the corner of the first pixel (its centre is
+at +0.5), as in COLMAP. Reading and writing of COLMAP's files is in ``colmap_io``.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ class Lens:
 
 @dataclass
 class Photo:
-    """A posed photograph. name: as COLMAP has it, ``start/0003.jpg``.  lens: key into ``Model.lenses``.  viewmat: [4, 4] world -> camera.
+    """A posed photograph. name: as COLMAP has it, ``start/0003.jpg``.  lens: key into ``Model.lenses``.  viewmat: [4,
+    4] world -> camera.
 
     xy: [M, 2] keypoints.  point: [M] int64, id of the point that each belongs to, -1 for none.
     """
@@ -177,7 +178,8 @@ class Model:
 
 
 def similarity(source: np.ndarray, target: np.ndarray, weight=None, with_scale: bool = True) -> np.ndarray:
-    """[4, 4] least-squares similarity that takes points [N, 3] to others [N, 3] (Umeyama 1991, doi:10.1109/34.88573)."""
+    """[4, 4] least-squares similarity that takes points [N, 3] to others [N, 3] (Umeyama 1991,
+    doi:10.1109/34.88573)."""
     w = np.ones(len(source)) if weight is None else np.asarray(weight, float)
     w = w / w.sum()
     a, b = w @ source, w @ target

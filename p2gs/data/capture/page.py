@@ -1,4 +1,5 @@
-"""``capture.html``: cameras and sparse cloud from above and from the side, a sheet of the masked photographs, the figures."""
+"""``capture.html``: cameras and sparse cloud from above and from the side, a sheet of the masked photographs, the
+figures."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """The photographs of a state, brought upright and free of tags into the work folder: what every later stage looks at.
 
-Nothing but pixels, the focal length and the time is taken from EXIF; a place where a photograph was taken is never copied.
+Nothing but pixels, the focal length and the time is taken from EXIF; a place where a photograph was taken is never
+copied.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ FILM_DIAGONAL = 43.27  # mm; lenses' "35 mm equivalent" compares diagonals
 
 @dataclass(frozen=True)
 class Shot:
-    """A copied photograph. name: of the copy (``start/0003.jpg``).  source: where it came from.  focal: pixels from EXIF, or None.
+    """A copied photograph. name: of the copy (``start/0003.jpg``).  source: where it came from.  focal: pixels from
+    EXIF, or None.
 
-    device: what took it, for photographs that share a lens.  sharpness: variance of the Laplacian at 640 px.  alpha: file of the copy's
-    alpha channel, or None.
+    device: what took it, for photographs that share a lens.  sharpness: variance of the Laplacian at 640 px.  alpha:
+    file of the copy's alpha channel, or None.
     """
 
     name: str
@@ -51,7 +53,8 @@ def natural(path: Path) -> list:
 
 
 def listed(source: Path) -> list[Path]:
-    """The photographs of a folder in order of their names. Raises UserError where there are too few or a kind cannot be read."""
+    """The photographs of a folder in order of their names. Raises UserError where there are too few or a kind cannot be
+    read."""
     if not source.is_dir():
         raise UserError(f"{source}: there is no such folder of photographs, nor such a video")
     files = sorted((p for p in source.iterdir() if p.is_file() and not p.name.startswith(".")), key=natural)
@@ -76,7 +79,8 @@ def heic_opener() -> bool:
 
 
 def copy_photos(source: Path, state: str, folder: Path, size: int, limit: int) -> list[Shot]:
-    """Upright copies of a state's photographs as ``folder/state/NNNN.jpg``, at most ``limit``, long edge at most ``size``.
+    """Upright copies of a state's photographs as ``folder/state/NNNN.jpg``, at most ``limit``, long edge at most
+    ``size``.
 
     Raises UserError for a file that cannot be read, naming it.
     """
@@ -102,7 +106,14 @@ def _copied(path: Path, state: str, index: int, folder: Path, size: int) -> Shot
             exif = image.getexif()
             focal, device = _focal_35(exif), str(exif.get(EXIF_MODEL, "")).strip()
             pixels = np.asarray(ImageOps.exif_transpose(image).convert("RGBA" if "A" in image.getbands() else "RGB"))
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError, ValueError, SyntaxError, OverflowError) as err:
+    except (
+        OSError,
+        UnidentifiedImageError,
+        Image.DecompressionBombError,
+        ValueError,
+        SyntaxError,
+        OverflowError,
+    ) as err:
         raise UserError(f"{path}: cannot be read as a photograph ({err})") from err
     if min(pixels.shape[:2]) < 200:
         raise UserError(
@@ -122,7 +133,8 @@ def _focal_35(exif) -> Optional[float]:
 
 
 def store(pixels, source: str, focal, device: str, state: str, index: int, folder: Path, size: int) -> Shot:
-    """Write one copy (RGB or RGBA [H, W, 3|4] uint8, upright) and say what it is. focal: pixels of ``pixels``, or None."""
+    """Write one copy (RGB or RGBA [H, W, 3|4] uint8, upright) and say what it is. focal: pixels of ``pixels``, or
+    None."""
     import cv2
 
     height, width = pixels.shape[:2]

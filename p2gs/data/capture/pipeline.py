@@ -1,4 +1,5 @@
-"""``p2gs data capture``: the stages in their order, each kept in ``SCENE/.capture`` and skipped when what it read is unchanged."""
+"""``p2gs data capture``: the stages in their order, each kept in ``SCENE/.capture`` and skipped when what it read is
+unchanged."""
 
 from __future__ import annotations
 
@@ -35,8 +36,9 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Options:
-    """masks: folder of masks.  ignore: nerfstudio's meaning of them.  poses: COLMAP model or transforms.json.  static: number of the
-    hypothesis to take.  height: metres of the object.  max_views: photographs a state.  size: long edge in pixels."""
+    """masks: folder of masks.  ignore: nerfstudio's meaning of them.  poses: COLMAP model or transforms.json.  static:
+    number of the hypothesis to take.  height: metres of the object.  max_views: photographs a state.  size: long edge
+    in pixels."""
 
     masks: Optional[Path] = None
     ignore: bool = False
@@ -76,7 +78,8 @@ def _stamp(source: Path) -> list:
 
 
 def capture_scene(start: Path, end: Path, out: Path, options: Options, progress: Progress = lambda text: None) -> Path:
-    """Write the scene of two states' photographs; returns its folder. Raises UserError where the photographs cannot carry it."""
+    """Write the scene of two states' photographs; returns its folder. Raises UserError where the photographs cannot
+    carry it."""
     if out.is_file() or (out.is_dir() and any(out.iterdir()) and not (out / ".capture").is_dir()):
         raise UserError(f"{out}: is there already and was not made by p2gs data capture; expected a new folder")
     cache = Cache(out / ".capture")
@@ -158,7 +161,8 @@ def _keep(masks: dict[str, np.ndarray], folder: Path) -> None:
 
 
 def _reconstructed(state: str, shots: list[Shot], work: Path, cache: Cache, careful: bool, progress: Progress) -> State:
-    """A state alone: with quick settings, with careful ones where those place too few. Raises UserError where both do."""
+    """A state alone: with quick settings, with careful ones where those place too few. Raises UserError where both
+    do."""
     from p2gs.data.capture.sfm import default_effort
 
     total, result = len(shots), {"registered": 0, "models": 0}
@@ -236,16 +240,16 @@ def _oriented(model: Model, corners: dict[int, int]) -> tuple[Model, dict]:
         metres, source = 1 / float(np.cbrt(np.linalg.det(T[:3, :3]))), "board"
         normal = T[:3, 2] * metres
         normal = normal * np.sign(normal @ frame.mean_up(model))
-        if (
-            normal @ floor.normal < np.cos(np.radians(5)) or floor.source == "cameras"
-        ):  # two measures of one floor: the larger plane is better
+        # two measures of one floor: the larger plane is better
+        if normal @ floor.normal < np.cos(np.radians(5)) or floor.source == "cameras":
             floor = frame.Floor(normal, float(normal @ T[:3, 3]), "board")
         about["board_rms_mm"] = round(1000 * rms, 2)
     return model.moved(frame.to_world(floor, model, metres)), about | {"scale": {"source": source}, "up": floor.source}
 
 
 def _scaled(model: Model, masks: dict[str, np.ndarray], options: Options, about: dict) -> Model:
-    """The model with the object's height, or else its diagonal of 1, where no board gave metres; notes it in ``about``."""
+    """The model with the object's height, or else its diagonal of 1, where no board gave metres; notes it in
+    ``about``."""
     scale = about["scale"]
     if scale["source"] != "board":
         box = _object_box(model, masks)

@@ -1,7 +1,8 @@
-"""Poses that somebody has already: a COLMAP model or nerfstudio's ``transforms.json``, brought to the copied photographs.
+"""Poses that somebody has already: a COLMAP model or nerfstudio's ``transforms.json``, brought to the copied
+photographs.
 
-COLMAP's files are what RealityScan, Metashape, VGGT and others export; ``transforms.json`` is what ns-process-data makes of Polycam,
-Record3D, KIRI and others. No pycolmap is needed.
+COLMAP's files are what RealityScan, Metashape, VGGT and others export; ``transforms.json`` is what ns-process-data
+makes of Polycam, Record3D, KIRI and others. No pycolmap is needed.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2"
 
 
 def read_poses(path: Path) -> Model:
-    """The model at a path: a ``transforms.json``, a folder that holds one, two in ``start`` and ``end``, or a COLMAP model."""
+    """The model at a path: a ``transforms.json``, a folder that holds one, two in ``start`` and ``end``, or a COLMAP
+    model."""
     if not path.exists():
         raise UserError(f"{path}: there are no poses here; expected a COLMAP model's folder or a transforms.json")
     if path.is_file():
@@ -90,7 +92,8 @@ def _c2w(given, where: str) -> np.ndarray:
 
 
 def read_transforms(files: list[tuple[Path, str]]) -> Model:
-    """Model without points of nerfstudio files, each with a prefix for its photographs' names. All must share one frame.
+    """Model without points of nerfstudio files, each with a prefix for its photographs' names. All must share one
+    frame.
 
     Raises UserError where a file lacks something, naming it.
     """
@@ -107,12 +110,18 @@ def read_transforms(files: list[tuple[Path, str]]) -> Model:
         undo = _unapplied(meta, str(path))
         for i, frame in enumerate(meta["frames"]):
             where = f"{path}: frame {i}"
-            if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or "transform_matrix" not in frame:
+            if (
+                not isinstance(frame, dict)
+                or not isinstance(frame.get("file_path"), str)
+                or "transform_matrix" not in frame
+            ):
                 raise UserError(f"{where} needs 'file_path' and 'transform_matrix'")
             try:
                 lens = _frame_lens(meta, frame, where)
             except (TypeError, ValueError, OverflowError) as err:
-                raise UserError(f"{where}: its lens cannot be read ({err}); expected numbers fl_x, fl_y, cx, cy, w, h") from err
+                raise UserError(
+                    f"{where}: its lens cannot be read ({err}); expected numbers fl_x, fl_y, cx, cy, w, h"
+                ) from err
             key = known.setdefault((lens.model, lens.width, lens.height, lens.params.tobytes()), len(known) + 1)
             lenses[key] = lens
             report = Report()
@@ -132,7 +141,8 @@ def _rigid(c2w: np.ndarray) -> np.ndarray:
 
 
 def state_of(name: str, start: Path, end: Path, in_start: bool, in_end: bool) -> str | None:
-    """'start' or 'end' for a photograph's name, by the folder that has such a file, else by the folders in its name; None for neither."""
+    """'start' or 'end' for a photograph's name, by the folder that has such a file, else by the folders in its name;
+    None for neither."""
     if in_start != in_end:
         return "start" if in_start else "end"
     if not in_start:

@@ -1,8 +1,9 @@
 """Structure from motion with pycolmap, in a process of its own: ``python -m p2gs.data.capture.sfm JOB.json``.
 
-The only file that imports pycolmap. It runs as a child because COLMAP aborts the interpreter where others raise (a wheel asked for ONNX
-features, for one). What it has to do stands in the job file; what it found goes to ``out``; its progress goes to stdout, one line each.
-Incremental mapping and SIFT only: global mapping misplaced photographs of small captures, and the wheel has no other features.
+The only file that imports pycolmap. It runs as a child because COLMAP aborts the interpreter where others raise (a
+wheel asked for ONNX features, for one). What it has to do stands in the job file; what it found goes to ``out``; its
+progress goes to stdout, one line each. Incremental mapping and SIFT only: global mapping misplaced photographs of small
+captures, and the wheel has no other features.
 """
 
 from __future__ import annotations
@@ -26,9 +27,8 @@ class Effort:
     max_size: int = 1200
     first_octave: int = 0
     features: int = 3000
-    peak: float = (
-        0.004  # contrast below which a feature is noise; COLMAP's own is 0.0067, fewer features on plain walls
-    )
+    # contrast below which a feature is noise; COLMAP's own is 0.0067, fewer features on plain walls
+    peak: float = 0.004
     init_inliers: int = 60
     init_angle: float = 8.0  # degrees
     pose_inliers: int = 20
@@ -45,7 +45,8 @@ def say(text: str) -> None:
 
 
 def reconstruct(job: dict) -> dict:
-    """One state alone. job: images (folder), groups [{names, model, params, known_focal}], effort, out (folder), threads, seed.
+    """One state alone. job: images (folder), groups [{names, model, params, known_focal}], effort, out (folder),
+    threads, seed.
 
     Writes out/model (COLMAP) and out/descriptors.npz (ids [P], mean descriptors [P, 128] uint8); returns counts.
     """

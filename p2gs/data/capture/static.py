@@ -13,7 +13,8 @@ from p2gs.data.capture.joint import guided_pairs, states_of
 from p2gs.data.capture.model import Model
 from p2gs.types import UserError
 
-SAME = 0.04  # of the cameras' distance: hypotheses that move the object's place by less than this are one; a board alone is as exact
+# of the cameras' distance: hypotheses that move the object's place by less than this are one; a board alone is as exact
+SAME = 0.04
 ADVICE = "lay newspapers, a patterned rug or the printed board (p2gs data board) around the object and photograph both states again"
 
 
@@ -28,7 +29,8 @@ def apart(model: Model, A: np.ndarray, B: np.ndarray) -> float:
 
 
 def hypotheses_of(start: State, end: State, seen: dict) -> list[Hypothesis]:
-    """All hypotheses, widest first; each told whether the board agrees. The board's own is added where no other agrees with it."""
+    """All hypotheses, widest first; each told whether the board agrees. The board's own is added where no other agrees
+    with it."""
     found = find_hypotheses(start, end)
     T = marker_board.board_similarity(start.model, end.model, seen)
     if T is None:
@@ -42,7 +44,8 @@ def hypotheses_of(start: State, end: State, seen: dict) -> list[Hypothesis]:
 
 
 def choose(found: list[Hypothesis], given: int | None, where: Path) -> int:
-    """Index of the static hypothesis. given: the user's choice. Raises UserError, with what to do, where none can be trusted."""
+    """Index of the static hypothesis. given: the user's choice. Raises UserError, with what to do, where none can be
+    trusted."""
     if given is not None:
         if not 0 <= given < len(found):
             raise UserError(f"--static {given}: there are {len(found)} hypotheses, counted from 0")
@@ -66,7 +69,8 @@ def choose(found: list[Hypothesis], given: int | None, where: Path) -> int:
 
 
 def check_joint_support(model: Model) -> dict:
-    """Where the points lie that both states show, for poses that somebody else solved. Raises UserError where they are confined.
+    """Where the points lie that both states show, for poses that somebody else solved. Raises UserError where they are
+    confined.
 
     A model without points says nothing, and neither does this.
     """

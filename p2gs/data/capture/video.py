@@ -1,4 +1,5 @@
-"""Sharp frames of a video: three times as many are looked at as are kept, the sharpest of each stretch of time stays."""
+"""Sharp frames of a video: three times as many are looked at as are kept, the sharpest of each stretch of time
+stays."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ LOOKED_AT = 3  # frames per kept one: a shaken hand is still somewhere in a stre
 
 
 def sharp_frames(path: Path, count: int) -> list[tuple[float, np.ndarray]]:
-    """(time in seconds, upright RGB [H, W, 3]) of ``count`` frames. Raises UserError where the video cannot be read or is too short."""
+    """(time in seconds, upright RGB [H, W, 3]) of ``count`` frames. Raises UserError where the video cannot be read or
+    is too short."""
     import cv2
 
     video = cv2.VideoCapture(str(path))

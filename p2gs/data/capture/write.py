@@ -1,4 +1,5 @@
-"""The scene folder: undistorted RGBA images in the ArtGS layout, a COLMAP model of them, a ``transforms.json`` per state."""
+"""The scene folder: undistorted RGBA images in the ArtGS layout, a COLMAP model of them, a ``transforms.json`` per
+state."""
 
 from __future__ import annotations
 
@@ -44,8 +45,8 @@ def write_scene(
 ) -> dict[str, str]:
     """Write everything; returns photograph's name -> file below ``out``.
 
-    model: in scene coordinates, photographs named as the copies in ``photos``.  masks: [H, W] uint8 by name; a photograph
-    without one is left out.  gains: see ``gains``.
+    model: in scene coordinates, photographs named as the copies in ``photos``.  masks: [H, W] uint8 by name; a
+    photograph without one is left out.  gains: see ``gains``.
     """
     import cv2
 

@@ -12,7 +12,8 @@ from p2gs.data.generated.shapes import Primitive, triangulate
 
 @dataclass(frozen=True)
 class SyntheticJoint:
-    """Axis [3] unit through origin [3] in object coordinates; start, end: joint value in both states (degrees or length, 0 = as built)."""
+    """Axis [3] unit through origin [3] in object coordinates; start, end: joint value in both states (degrees or
+    length, 0 = as built)."""
 
     type: Literal["revolute", "prismatic"]
     axis: np.ndarray
@@ -40,7 +41,9 @@ class SyntheticJoint:
 
 def revolute(axis, origin, start: float, end: float) -> SyntheticJoint:
     axis = np.asarray(axis, float)
-    return SyntheticJoint("revolute", axis / np.linalg.norm(axis), np.asarray(origin, float), float(start) + 0.0, float(end) + 0.0)
+    return SyntheticJoint(
+        "revolute", axis / np.linalg.norm(axis), np.asarray(origin, float), float(start) + 0.0, float(end) + 0.0
+    )
 
 
 def prismatic(axis, origin, start: float, end: float) -> SyntheticJoint:
@@ -90,7 +93,9 @@ class SyntheticObject:
             joint = part.joint
             if joint is not None:
                 factor = float(scale) if joint.type == "prismatic" else 1.0
-                joint = replace(joint, origin=scale * (joint.origin - centre), start=factor * joint.start, end=factor * joint.end)
+                joint = replace(
+                    joint, origin=scale * (joint.origin - centre), start=factor * joint.start, end=factor * joint.end
+                )
             parts.append(SyntheticPart(part.name, tuple(q.scaled(scale, centre) for q in part.primitives), joint))
         return SyntheticObject(self.name, tuple(parts))
 
@@ -114,4 +119,6 @@ class SyntheticObject:
 def concatenate(meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Several (vertices, faces) as one."""
     offsets = np.cumsum([0] + [len(v) for v, _ in meshes[:-1]])
-    return np.concatenate([v for v, _ in meshes]), np.concatenate([f + o for (_, f), o in zip(meshes, offsets, strict=True)])
+    return np.concatenate([v for v, _ in meshes]), np.concatenate(
+        [f + o for (_, f), o in zip(meshes, offsets, strict=True)]
+    )

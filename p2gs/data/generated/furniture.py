@@ -30,7 +30,9 @@ class Palette:
         hue, sat = self.hue + rng.uniform(-self.spread, self.spread), rng.uniform(0.25, 0.7)
         value = np.clip(bright * rng.uniform(0.8, 1.25), 0.2, 1)
         first = colorsys.hsv_to_rgb(hue % 1, sat, value)
-        second = colorsys.hsv_to_rgb((hue + rng.uniform(-0.08, 0.08)) % 1, sat * rng.uniform(0.4, 1.2) % 1, value * rng.uniform(0.45, 0.75))
+        second = colorsys.hsv_to_rgb(
+            (hue + rng.uniform(-0.08, 0.08)) % 1, sat * rng.uniform(0.4, 1.2) % 1, value * rng.uniform(0.45, 0.75)
+        )
         return Texture(pattern, first, second, period * rng.uniform(0.6, 1.6), int(rng.integers(2**31)))
 
     def metal(self) -> Texture:
@@ -40,7 +42,8 @@ class Palette:
 
 @dataclass(frozen=True)
 class Cell:
-    """An opening of a carcass: front plane at x, y0..y1, z0..z1, ``depth`` behind it. outer: edges on the carcass' outside."""
+    """An opening of a carcass: front plane at x, y0..y1, z0..z1, ``depth`` behind it. outer: edges on the carcass'
+    outside."""
 
     x: float
     y0: float
@@ -57,8 +60,17 @@ def part_open(rng: np.random.Generator, lo: float, hi: float, chance: float = 0.
     return (rng.uniform(0.1, 0.2) * end if rng.random() < chance else 0.0), end
 
 
-def carcass(rng: np.random.Generator, palette: Palette, depth: float, width: float, height: float, columns: list[int], wall: float = 0.04):
-    """A shelf without fronts, boards meeting without overlap. columns: number of cells, one above the other, per column.
+def carcass(
+    rng: np.random.Generator,
+    palette: Palette,
+    depth: float,
+    width: float,
+    height: float,
+    columns: list[int],
+    wall: float = 0.04,
+):
+    """A shelf without fronts, boards meeting without overlap. columns: number of cells, one above the other, per
+    column.
 
     Returns (primitives, cells); corner at x = -depth/2 .. depth/2, y = -width/2 .. width/2, z = 0 .. height.
     """
@@ -89,7 +101,9 @@ def carcass(rng: np.random.Generator, palette: Palette, depth: float, width: flo
     return boards, cells
 
 
-def handle(rng: np.random.Generator, palette: Palette, x: float, y: float, z: float, upright: bool, size: float) -> list[Primitive]:
+def handle(
+    rng: np.random.Generator, palette: Palette, x: float, y: float, z: float, upright: bool, size: float
+) -> list[Primitive]:
     """A bar on two feet or a knob in front of the plane x."""
     metal = palette.metal()
     if rng.random() < 0.35:
@@ -97,12 +111,21 @@ def handle(rng: np.random.Generator, palette: Palette, x: float, y: float, z: fl
     along = np.array([0, 0, 1.0]) if upright else np.array([0, 1.0, 0])
     centre, half = np.array([x + 0.045, y, z]), 0.5 * size
     bar = cylinder(centre - half * along, centre + half * along, 0.014, metal)
-    feet = [cylinder(centre + s * 0.8 * half * along - [0.045, 0, 0], centre + s * 0.8 * half * along, 0.010, metal) for s in (-1, 1)]
+    feet = [
+        cylinder(centre + s * 0.8 * half * along - [0.045, 0, 0], centre + s * 0.8 * half * along, 0.010, metal)
+        for s in (-1, 1)
+    ]
     return [bar, *feet]
 
 
 def door(
-    rng: np.random.Generator, palette: Palette, cell: Cell, side: str, angles=None, thick: float = 0.045, texture: Optional[Texture] = None
+    rng: np.random.Generator,
+    palette: Palette,
+    cell: Cell,
+    side: str,
+    angles=None,
+    thick: float = 0.045,
+    texture: Optional[Texture] = None,
 ) -> SyntheticPart:
     """A front hinged at its outer front edge. side: left (low y), right, bottom or top."""
     texture = texture or palette.texture()
@@ -143,14 +166,24 @@ def tray(rng: np.random.Generator, lo, hi, texture: Texture, wall: float = 0.022
 
 
 def drawer(
-    rng: np.random.Generator, palette: Palette, cell: Cell, reach=None, thick: float = 0.045, texture: Optional[Texture] = None
+    rng: np.random.Generator,
+    palette: Palette,
+    cell: Cell,
+    reach=None,
+    thick: float = 0.045,
+    texture: Optional[Texture] = None,
 ) -> SyntheticPart:
     """A front with an open box behind it. reach: (start, end) as shares of the box' length."""
     y0, y1, z0, z1 = cell.y0 + GAP / 2, cell.y1 - GAP / 2, cell.z0 + GAP / 2, cell.z1 - GAP / 2
     x0, x1 = cell.x + 0.004, cell.x + 0.004 + thick
     length = rng.uniform(0.75, 0.92) * cell.depth
     side = 0.055  # clear of the carcass' walls
-    inner = tray(rng, (x0 - length, y0 + side, z0 + side), (x0, y1 - side, z1 - side - 0.15 * (z1 - z0)), palette.texture(bright=0.85))
+    inner = tray(
+        rng,
+        (x0 - length, y0 + side, z0 + side),
+        (x0, y1 - side, z1 - side - 0.15 * (z1 - z0)),
+        palette.texture(bright=0.85),
+    )
     front = box((x0, y0, z0), (x1, y1, z1), texture or palette.texture())
     grip = handle(rng, palette, x1, (y0 + y1) / 2, (z0 + z1) / 2, False, rng.uniform(0.2, 0.4) * (y1 - y0))
     start, end = reach or part_open(rng, 0.35, 0.85)
@@ -182,11 +215,23 @@ def demo_cabinet() -> SyntheticObject:
         box((x0 + 0.02, wall - y, split - 0.02), (x1, y - wall, split + 0.02), lining),
         box((x0 + 0.02, wall - y, 0.74), (0.2, y - wall, 0.765), lining),
     ]
-    jar = cylinder((-0.08, -0.12, 0.765), (-0.08, -0.12, 0.93), 0.09, Texture("stripes", (0.85, 0.30, 0.25), (0.95, 0.90, 0.80), 0.09, 5))
+    jar = cylinder(
+        (-0.08, -0.12, 0.765),
+        (-0.08, -0.12, 0.93),
+        0.09,
+        Texture("stripes", (0.85, 0.30, 0.25), (0.95, 0.90, 0.80), 0.09, 5),
+    )
     low = Cell(x1, -y, y, 0, split, depth - 0.02, ("left", "right"))
     high = Cell(x1, -y, y, split, height, depth - 0.02, ("left", "right"))
     moving = [
-        door(rng, palette, high, "left", (0, 70), texture=Texture("checks", (0.30, 0.52, 0.56), (0.20, 0.36, 0.42), 0.30, 3)),
+        door(
+            rng,
+            palette,
+            high,
+            "left",
+            (0, 70),
+            texture=Texture("checks", (0.30, 0.52, 0.56), (0.20, 0.36, 0.42), 0.30, 3),
+        ),
         drawer(rng, palette, low, (0, 0.6), texture=Texture("noise", (0.86, 0.66, 0.26), (0.60, 0.40, 0.16), 0.20, 4)),
     ]
     return assemble("cabinet", [*boards, jar], moving)
@@ -201,10 +246,14 @@ def _fill(rng: np.random.Generator, palette: Palette, cell: Cell, drawers: float
     return door(rng, palette, cell, str(rng.choice(cell.outer)) if cell.outer else str(rng.choice(["left", "right"])))
 
 
-def _storage(rng: np.random.Generator, name: str, columns: list[int], drawers: float, size, open_cells: int = 0) -> SyntheticObject:
+def _storage(
+    rng: np.random.Generator, name: str, columns: list[int], drawers: float, size, open_cells: int = 0
+) -> SyntheticObject:
     palette = Palette(rng)
     boards, cells = carcass(rng, palette, *size, columns)
-    left_open = set(rng.choice(len(cells), min(open_cells, len(cells) - 1), replace=False).tolist()) if open_cells else set()
+    left_open = (
+        set(rng.choice(len(cells), min(open_cells, len(cells) - 1), replace=False).tolist()) if open_cells else set()
+    )
     moving = [_fill(rng, palette, c, drawers) for i, c in enumerate(cells) if i not in left_open]
     return assemble(name, boards, moving)
 
@@ -253,7 +302,9 @@ def oven(rng: np.random.Generator) -> SyntheticObject:
     boards.append(box((top.x, top.y0, top.z1 - 0.15), (top.x + 0.05, top.y1, top.z1), palette.texture()))
     z, middle = top.z1 - 0.075, (top.z0 + top.z1) / 2
     knobs = [cylinder((top.x + 0.05, y, z), (top.x + 0.09, y, z), 0.035, palette.metal()) for y in (-0.25, 0, 0.25)]
-    boards.append(box((top.x - top.depth, top.y0 + 0.05, middle), (top.x - 0.05, top.y1 - 0.05, middle + 0.02), palette.metal()))
+    boards.append(
+        box((top.x - top.depth, top.y0 + 0.05, middle), (top.x - 0.05, top.y1 - 0.05, middle + 0.02), palette.metal())
+    )
     moving = [door(rng, palette, panel, "bottom", part_open(rng, 45, 90))]
     moving += [drawer(rng, palette, c) for c in cells[:-1]]
     return assemble("oven", [*boards, *knobs], moving)
@@ -285,5 +336,7 @@ def table(rng: np.random.Generator) -> SyntheticObject:
     wood, width = boards[0].texture, -2 * cells[0].y0
     corners = [(x, y) for x in (-0.34, 0.34) for y in (-width / 2, width / 2)]
     legs = [box((x, y, -0.6), (x - 0.07 * np.sign(x), y - 0.07 * np.sign(y), 0), wood) for x, y in corners]
-    top = box((-0.4, -width / 2 - 0.05, cells[0].z1), (0.44, width / 2 + 0.05, cells[0].z1 + 0.05), palette.texture("wood"))
+    top = box(
+        (-0.4, -width / 2 - 0.05, cells[0].z1), (0.44, width / 2 + 0.05, cells[0].z1 + 0.05), palette.texture("wood")
+    )
     return assemble("table", [*boards, *legs, top], [drawer(rng, palette, c) for c in cells])

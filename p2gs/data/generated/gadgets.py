@@ -17,10 +17,18 @@ def laptop(rng: np.random.Generator) -> SyntheticObject:
     body = [box((-depth / 2, -width / 2, 0), (depth / 2, width / 2, thick), palette.texture())]
     keys = palette.texture("checks", period=0.12)
     body.append(box((-0.35 * depth, -0.42 * width, thick), (0.1 * depth, 0.42 * width, thick + 0.008), keys))
-    body.append(box((0.2 * depth, -0.15 * width, thick), (0.42 * depth, 0.15 * width, thick + 0.004), palette.texture()))
+    body.append(
+        box((0.2 * depth, -0.15 * width, thick), (0.42 * depth, 0.15 * width, thick + 0.004), palette.texture())
+    )
     z = thick + 0.014
     lid = [box((-depth / 2, -width / 2, z), (depth / 2, width / 2, z + 0.7 * thick), palette.texture())]
-    lid.append(box((-0.42 * depth, -0.44 * width, z - 0.004), (0.42 * depth, 0.44 * width, z), palette.texture("noise", bright=0.5)))
+    lid.append(
+        box(
+            (-0.42 * depth, -0.44 * width, z - 0.004),
+            (0.42 * depth, 0.44 * width, z),
+            palette.texture("noise", bright=0.5),
+        )
+    )
     joint = revolute((0, -1, 0), (-depth / 2, 0, z - 0.007), rng.uniform(10, 45), rng.uniform(80, 125))
     return assemble("laptop", body, [SyntheticPart("lid", tuple(lid), joint)])
 
@@ -37,7 +45,9 @@ def scissors(rng: np.random.Generator) -> SyntheticObject:
         pieces = [box((-0.08, -0.045, z), (0.85, 0.045, z + thick), blade)]
         direction = np.array([-0.45, y])
         tilt = np.arctan2(direction[1], direction[0])
-        arm = box((-0.5 * np.linalg.norm(direction), -0.035, z), (0.5 * np.linalg.norm(direction), 0.035, z + thick), blade)
+        arm = box(
+            (-0.5 * np.linalg.norm(direction), -0.035, z), (0.5 * np.linalg.norm(direction), 0.035, z + thick), blade
+        )
         pose = np.eye(4)
         c, s = np.cos(tilt), np.sin(tilt)
         pose[:2, :2], pose[:2, 3] = [[c, -s], [s, c]], direction / 2 - [0.05, 0]
@@ -48,7 +58,11 @@ def scissors(rng: np.random.Generator) -> SyntheticObject:
     lower, upper = half(1.0, 0.0), half(-1.0, thick + 0.004)
     pin = [cylinder((0, 0, -0.02), (0, 0, -0.001), 0.05, palette.metal())]
     start, end = part_open(rng, 30, 70, chance=0.6)
-    return assemble("scissors", lower + pin, [SyntheticPart("blade", tuple(upper), revolute((0, 0, 1), (0, 0, 0), start + 4, end + 4))])
+    return assemble(
+        "scissors",
+        lower + pin,
+        [SyntheticPart("blade", tuple(upper), revolute((0, 0, 1), (0, 0, 0), start + 4, end + 4))],
+    )
 
 
 @KINDS.register("valve")
@@ -57,7 +71,10 @@ def valve(rng: np.random.Generator) -> SyntheticObject:
     palette = Palette(rng)
     pipe = palette.texture()
     radius, spokes, height = rng.uniform(0.38, 0.5), int(rng.integers(3, 6)), rng.uniform(0.45, 0.6)
-    base = [cylinder((0, -0.7, 0), (0, 0.7, 0), 0.17, pipe), cylinder((0, 0, 0.15), (0, 0, height - 0.06), 0.09, palette.texture())]
+    base = [
+        cylinder((0, -0.7, 0), (0, 0.7, 0), 0.17, pipe),
+        cylinder((0, 0, 0.15), (0, 0, height - 0.06), 0.09, palette.texture()),
+    ]
     base += [cylinder((0, y - 0.03, 0), (0, y + 0.03, 0), 0.26, palette.metal()) for y in (-0.66, 0.66)]
     wheel = ring((0, 0, height), (0, 0, 1), radius, 0.04, palette.texture(), 24)
     wheel.append(cylinder((0, 0, height - 0.05), (0, 0, height + 0.06), 0.085, palette.metal()))
@@ -67,7 +84,9 @@ def valve(rng: np.random.Generator) -> SyntheticObject:
     wheel.append(cylinder((radius, 0, height + 0.03), (radius, 0, height + 0.2), 0.035, palette.texture()))
     start, end = part_open(rng, 35, 100)
     sign = 1 if rng.random() < 0.5 else -1
-    return assemble("valve", base, [SyntheticPart("wheel", tuple(wheel), revolute((0, 0, 1), (0, 0, 0), sign * start, sign * end))])
+    return assemble(
+        "valve", base, [SyntheticPart("wheel", tuple(wheel), revolute((0, 0, 1), (0, 0, 0), sign * start, sign * end))]
+    )
 
 
 def _window_frame(palette: Palette, width: float, height: float, depth: float, bar: float):
@@ -88,7 +107,11 @@ def _sash(palette: Palette, x: float, thick: float, y0: float, y1: float, z0: fl
         box((x, y0, z1 - bar), (x + thick, y1, z1), wood),
         box((x, y0, z0 + bar), (x + thick, y0 + bar, z1 - bar), wood),
         box((x, y1 - bar, z0 + bar), (x + thick, y1, z1 - bar), wood),
-        box((x + 0.3 * thick, y0 + bar, z0 + bar), (x + 0.7 * thick, y1 - bar, z1 - bar), palette.texture("noise", bright=0.9)),
+        box(
+            (x + 0.3 * thick, y0 + bar, z0 + bar),
+            (x + 0.7 * thick, y1 - bar, z1 - bar),
+            palette.texture("noise", bright=0.9),
+        ),
     ]
 
 
@@ -97,7 +120,9 @@ def sliding_window(rng: np.random.Generator) -> SyntheticObject:
     """Two sashes in a frame; one slides in front of the other, sideways or up."""
     palette = Palette(rng)
     upright = rng.random() < 0.4
-    width, height = (rng.uniform(0.8, 1.0), rng.uniform(1.2, 1.4)) if upright else (rng.uniform(1.2, 1.5), rng.uniform(0.8, 1.0))
+    width, height = (
+        (rng.uniform(0.8, 1.0), rng.uniform(1.2, 1.4)) if upright else (rng.uniform(1.2, 1.5), rng.uniform(0.8, 1.0))
+    )
     bar, sash, t = 0.07, 0.055, 0.05
     frame = _window_frame(palette, width, height, 0.2, bar)
     y0, y1, z0, z1 = -width / 2 + bar + 0.006, width / 2 - bar - 0.006, bar + 0.006, height - bar - 0.006
@@ -122,7 +147,13 @@ def casement_window(rng: np.random.Generator) -> SyntheticObject:
     wings = int(rng.integers(1, 3))
     width, height = rng.uniform(0.6, 0.75) * (1 + 0.6 * (wings - 1)), rng.uniform(0.9, 1.2)
     frame = _window_frame(palette, width, height, 0.14, 0.08)
-    frame.append(box((-0.02, -width / 2 + 0.08, height / 2 - 0.02), (0.02, width / 2 - 0.08, height / 2 + 0.02), palette.texture()))
+    frame.append(
+        box(
+            (-0.02, -width / 2 + 0.08, height / 2 - 0.02),
+            (0.02, width / 2 - 0.08, height / 2 + 0.02),
+            palette.texture(),
+        )
+    )
     edges = np.linspace(-width / 2 + 0.02, width / 2 - 0.02, wings + 1)
     outer = [("left", "right")] if wings == 1 else [("left",), ("right",)]
     cells = [Cell(0.07, edges[i], edges[i + 1], 0.02, height - 0.02, 0.1, outer[i]) for i in range(wings)]
@@ -145,7 +176,9 @@ def lid_box(rng: np.random.Generator) -> SyntheticObject:
     lid.append(cylinder((x, -0.12, z + 0.09), (x, 0.12, z + 0.09), 0.02, metal))
     lid += [box((x - 0.015, y - 0.015, z + 0.06), (x + 0.015, y + 0.015, z + 0.085), metal) for y in (-0.1, 0.1)]
     start, end = part_open(rng, 40, 105)
-    return assemble("lid_box", body, [SyntheticPart("lid", tuple(lid), revolute((0, -1, 0), (-depth / 2, 0, z), start, end))])
+    return assemble(
+        "lid_box", body, [SyntheticPart("lid", tuple(lid), revolute((0, -1, 0), (-depth / 2, 0, z), start, end))]
+    )
 
 
 @KINDS.register("cutter")

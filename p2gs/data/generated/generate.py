@@ -31,7 +31,15 @@ def synthesize(
     return write_scene(obj, out_dir, format, size, train_views, test_views, seed, depth, recipe=arguments)
 
 
-def recipe(seed: int, kind: Optional[str], size: int, train_views: int, test_views: int, format: str = "artgs", depth: bool = True) -> dict:
+def recipe(
+    seed: int,
+    kind: Optional[str],
+    size: int,
+    train_views: int,
+    test_views: int,
+    format: str = "artgs",
+    depth: bool = True,
+) -> dict:
     """What ``synthetic.json`` holds: enough to make the same scene again."""
     return {
         "generator": GENERATOR,

@@ -1,7 +1,7 @@
 """A small ray tracer for convex primitives: colour, alpha, depth and part ids of one view in numpy.
 
-All rays of a view share their origin, so 1 / direction is computed once per orientation and each primitive only looks at the
-rectangle of the image that it projects into.
+All rays of a view share their origin, so 1 / direction is computed once per orientation and each primitive only looks
+at the rectangle of the image that it projects into.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ LIGHT_DISTANCE = 8.0
 
 @dataclass(frozen=True)
 class Rendering:
-    """image [H, W, 3] uint8 straight, alpha [H, W] uint8, depth [H, W] float32 (z of the pixel centre's ray, 0 = nothing),
-    parts [H, W] int16 (part of the pixel centre's ray, -1 = nothing)."""
+    """image [H, W, 3] uint8 straight, alpha [H, W] uint8, depth [H, W] float32 (z of the pixel centre's ray, 0 =
+    nothing), parts [H, W] int16 (part of the pixel centre's ray, -1 = nothing)."""
 
     image: np.ndarray
     alpha: np.ndarray
@@ -29,8 +29,11 @@ class Rendering:
     parts: np.ndarray
 
 
-def _window(corners: np.ndarray, viewmat: np.ndarray, K: np.ndarray, xs: np.ndarray, ys: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns of the ray grid (normalised image coordinates ys, xs) that a box with these corners can cover."""
+def _window(
+    corners: np.ndarray, viewmat: np.ndarray, K: np.ndarray, xs: np.ndarray, ys: np.ndarray
+) -> tuple[slice, slice]:
+    """Rows and columns of the ray grid (normalised image coordinates ys, xs) that a box with these corners can
+    cover."""
     cam = corners @ viewmat[:3, :3].T + viewmat[:3, 3]
     if cam[:, 2].min() <= 1e-3:
         return slice(0, len(ys)), slice(0, len(xs))
@@ -69,7 +72,9 @@ def trace(primitives: Sequence[Primitive], viewmat: np.ndarray, K: np.ndarray, x
             p = primitives[k]
             o = ((origin - p.pose[:3, 3]) @ R).astype(np.float32)
             size = np.asarray(p.size, np.float32)
-            near, far = hit_interval(p.kind, size, o, [a[part] for a in d], [a[part] for a in inv], [a[part] for a in inv_abs])
+            near, far = hit_interval(
+                p.kind, size, o, [a[part] for a in d], [a[part] for a in inv], [a[part] for a in inv_abs]
+            )
             z = depth[r, c]
             hit = (near < far) & (near > 0) & (near < z)
             np.copyto(z, near, where=hit)
@@ -78,7 +83,8 @@ def trace(primitives: Sequence[Primitive], viewmat: np.ndarray, K: np.ndarray, x
 
 
 class Shadow:
-    """Where the key light reaches, for one state: the depth map seen from the light (Williams 1978, DOI 10.1145/965139.807402)."""
+    """Where the key light reaches, for one state: the depth map seen from the light (Williams 1978, DOI
+    10.1145/965139.807402)."""
 
     def __init__(self, primitives: Sequence[Primitive], size: int = 1024, bias: float = 0.012):
         corners = np.concatenate([p.corners for p in primitives])
@@ -96,12 +102,19 @@ class Shadow:
         self.depth = trace(primitives, viewmat, np.eye(3), grid, grid)[0]
 
     def lit(self, points: np.ndarray) -> np.ndarray:
-        """[N] float32 in 0..1 for world points [N, 3]: share of a 3x3 cross of map samples that the light reaches past."""
+        """[N] float32 in 0..1 for world points [N, 3]: share of a 3x3 cross of map samples that the light reaches
+        past."""
         p = (points - np.float32(self.light)) @ np.float32(self.R.T)
         uv = (p[:, :2] / p[:, 2:] / np.float32(self.reach) + 1) * np.float32(self.size / 2)
         x, y = (np.clip(uv[:, i].astype(np.int32), 2, self.size - 3) for i in (0, 1))
         z = p[:, 2] - np.float32(self.bias)
-        return sum((self.depth[y + j, x + i] >= z).astype(np.float32) for i, j in ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2))) / 5
+        return (
+            sum(
+                (self.depth[y + j, x + i] >= z).astype(np.float32)
+                for i, j in ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2))
+            )
+            / 5
+        )
 
 
 def _shade(primitive: Primitive, p_local: np.ndarray, shadow: Optional[Shadow]) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Primitives of generated objects: oriented boxes, cylinders, balls; their ray intersection, normals and triangles.
 
-Each is convex, so a ray's inside is one interval: the intersection of slabs (Kay and Kajiya 1986, DOI 10.1145/15922.15916) and a
-quadric. Rays are given as origin + z * direction with the direction's camera z equal to 1, so that z is the depth.
+Each is convex, so a ray's inside is one interval: the intersection of slabs (Kay and Kajiya 1986, DOI
+10.1145/15922.15916) and a quadric. Rays are given as origin + z * direction with the direction's camera z equal to 1,
+so that z is the depth.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ CYLINDER_SIDES = 48
 
 @dataclass(frozen=True)
 class Primitive:
-    """size: half extents [3] along the local axes; a cylinder stands along local z with size (r, r, h), a ball has (r, r, r).
+    """size: half extents [3] along the local axes; a cylinder stands along local z with size (r, r, h), a ball has (r,
+    r, r).
 
     pose: [4, 4] float64 local -> object at joint value 0.
     """
@@ -145,13 +147,16 @@ def local_normals(kind: Kind, size, p: np.ndarray) -> np.ndarray:
 
 
 def triangulate(primitive: Primitive) -> tuple[np.ndarray, np.ndarray]:
-    """(vertices [V, 3] float64, faces [F, 3] int64) in the coordinates of ``pose``, faces counter-clockwise from outside."""
+    """(vertices [V, 3] float64, faces [F, 3] int64) in the coordinates of ``pose``, faces counter-clockwise from
+    outside."""
     import trimesh
 
     if primitive.kind == "box":
         mesh = trimesh.creation.box(extents=2 * np.asarray(primitive.size))
     elif primitive.kind == "cylinder":
-        mesh = trimesh.creation.cylinder(radius=primitive.size[0], height=2 * primitive.size[2], sections=CYLINDER_SIDES)
+        mesh = trimesh.creation.cylinder(
+            radius=primitive.size[0], height=2 * primitive.size[2], sections=CYLINDER_SIDES
+        )
     else:
         mesh = trimesh.creation.icosphere(subdivisions=3, radius=primitive.size[0])
     vertices = mesh.vertices @ primitive.pose[:3, :3].T + primitive.pose[:3, 3]

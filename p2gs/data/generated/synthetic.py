@@ -1,7 +1,7 @@
 """Generated scenes: an object by kind and seed, cameras around it, its two states ray-traced. Nothing is downloaded.
 
-The same (kind, seed, size, number of views) gives the same pixels. Cameras follow the benchmarks: training views on the upper
-hemisphere at 3.2 units with a 50 mm lens, test views on a ring at 30 degrees.
+The same (kind, seed, size, number of views) gives the same pixels. Cameras follow the benchmarks: training views on the
+upper hemisphere at 3.2 units with a 50 mm lens, test views on a ring at 30 degrees.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ def cabinet() -> SyntheticObject:
 
 
 def make_object(kind: Optional[str] = None, seed: int = 0) -> SyntheticObject:
-    """A random object of a kind (see ``KINDS``; None: any; ``demo``: the demo cabinet, whatever the seed). Raises UserError."""
+    """A random object of a kind (see ``KINDS``; None: any; ``demo``: the demo cabinet, whatever the seed). Raises
+    UserError."""
     if kind == "demo":
         return cabinet()
     if kind is None:
@@ -56,7 +57,10 @@ def train_cameras(count: int, seed: int) -> list[np.ndarray]:
     height = np.clip((np.arange(count) + rng.uniform(0.1, 0.9, count)) / count, 0.02, 0.985)
     azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi) + rng.normal(0, 0.1, count)
     across = np.sqrt(1 - height**2)
-    return [look_at(RADIUS * np.array(x)) for x in zip(across * np.cos(azimuth), across * np.sin(azimuth), height, strict=True)]
+    return [
+        look_at(RADIUS * np.array(x))
+        for x in zip(across * np.cos(azimuth), across * np.sin(azimuth), height, strict=True)
+    ]
 
 
 def test_cameras(count: int) -> list[np.ndarray]:
@@ -79,14 +83,20 @@ def render_view(
     r = render(primitives, parts, viewmat, K, size, size, shadow=shadow)
     depth = np.where(r.alpha > 127, r.depth, 0).astype(np.float32)
     camera = Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), size, size)
-    return View(name, state, split, camera, torch.from_numpy(r.image), torch.from_numpy(r.alpha), torch.from_numpy(depth))
+    return View(
+        name, state, split, camera, torch.from_numpy(r.image), torch.from_numpy(r.alpha), torch.from_numpy(depth)
+    )
 
 
-def synthetic_scene(obj: SyntheticObject, size: int = 400, train_views: int = 64, test_views: int = 10, seed: int = 0) -> TwoStateScene:
+def synthetic_scene(
+    obj: SyntheticObject, size: int = 400, train_views: int = 64, test_views: int = 10, seed: int = 0
+) -> TwoStateScene:
     """Both states rendered, in memory; input units are the object's own."""
     views = []
     for state in (0, 1):
         shadow = Shadow(obj.posed(float(state))[0])
         for split, cameras in (("train", train_cameras(train_views, seed + state)), ("test", test_cameras(test_views))):
-            views += [render_view(obj, state, split, f"{i:04d}", viewmat, size, shadow) for i, viewmat in enumerate(cameras)]
+            views += [
+                render_view(obj, state, split, f"{i:04d}", viewmat, size, shadow) for i, viewmat in enumerate(cameras)
+            ]
     return TwoStateScene(obj.name, tuple(views))

@@ -13,7 +13,8 @@ PATTERNS: tuple[Pattern, ...] = ("noise", "wood", "stripes", "checks", "speckle"
 
 @dataclass(frozen=True)
 class Texture:
-    """colour, second: RGB in 0..1, mixed by the pattern.  period: length of one repetition, scene units.  seed: of its phases."""
+    """colour, second: RGB in 0..1, mixed by the pattern.  period: length of one repetition, scene units.  seed: of its
+    phases."""
 
     pattern: Pattern
     colour: tuple[float, float, float]

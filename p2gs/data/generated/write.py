@@ -134,15 +134,17 @@ def write_scene(
 ) -> Path:
     """Render both states and write images, cameras, depth (millimetres) and ground truth. Returns ``out_dir``.
 
-    size: image side in pixels.  seed: of the cameras.  recipe: kept as ``synthetic.json``.  DTA has no test views, PARIS no depth.
-    The folder appears only when all of it is written.  Raises UserError for an unknown format, sizes below 16 pixels, no training
-    view, and where ``out_dir`` is not empty.
+    size: image side in pixels.  seed: of the cameras.  recipe: kept as ``synthetic.json``.  DTA has no test views,
+    PARIS no depth. The folder appears only when all of it is written.  Raises UserError for an unknown format, sizes
+    below 16 pixels, no training view, and where ``out_dir`` is not empty.
     """
     root = Path(out_dir)
     if format not in WRITERS:
         raise UserError(f"unknown data format '{format}'{suggest(format, WRITERS)}")
     if size < 16 or train_views < 1 or test_views < 0:
-        raise UserError(f"a scene needs images of at least 16 pixels and one training view, not size={size}, train_views={train_views}")
+        raise UserError(
+            f"a scene needs images of at least 16 pixels and one training view, not size={size}, train_views={train_views}"
+        )
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise UserError(f"{root}: is not an empty folder, and a generated scene does not overwrite files")
     root.parent.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Checked:
-    """state: passes, fails, or not run.  notes: what is wrong, or why it was not run, a sentence each; what was found where it passes."""
+    """state: passes, fails, or not run.  notes: what is wrong, or why it was not run, a sentence each; what was found
+    where it passes."""
 
     tool: str
     file: str
@@ -29,9 +30,12 @@ class Checked:
 
 
 def check_folder(folder: Path) -> list[Checked]:
-    """Every validator on the files in a folder. Raises UserError where it has none of them, or the file's z axis is not up."""
+    """Every validator on the files in a folder. Raises UserError where it has none of them, or the file's z axis is not
+    up."""
     if not any((folder / name).is_file() for validator in VALIDATORS.values() for name in validator.files):
-        raise UserError(f"{folder}: has no twin.urdf to check; write it with p2gs export RUN --format urdf mjcf --out {folder}")
+        raise UserError(
+            f"{folder}: has no twin.urdf to check; write it with p2gs export RUN --format urdf mjcf --out {folder}"
+        )
     gravity = _gravity(folder / "twin.xml")
     if gravity is not None and gravity[2] >= 0:
         raise UserError(f"{folder / 'twin.xml'}: its gravity is {gravity}, but checks need an export with --up z")
@@ -61,7 +65,8 @@ def _check(tool: str, validator: Validator, folder: Path) -> Checked:
 
 
 def judged_apart(words: Sequence[str]) -> Judged:
-    """What a process of its own writes as JSON into the file that is its last argument: engines may crash, and print what they like."""
+    """What a process of its own writes as JSON into the file that is its last argument: engines may crash, and print
+    what they like."""
     with tempfile.TemporaryDirectory() as scratch:
         told = Path(scratch) / "judged.json"
         done = subprocess.run([*words, str(told)], capture_output=True, text=True, errors="replace")

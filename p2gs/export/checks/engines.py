@@ -1,7 +1,8 @@
-"""A twin in physics engines: does every joint reach both of its limits under a small force, and does it lie still under gravity?
+"""A twin in physics engines: does every joint reach both of its limits under a small force, and does it lie still under
+gravity?
 
-MuJoCo, PyBullet and SAPIEN, whichever are installed (``pip install p2gs[validate]``). Parts collide with the base and with each other, also
-with the part they hang on, which engines leave out unless asked.
+MuJoCo, PyBullet and SAPIEN, whichever are installed (``pip install p2gs[validate]``). Parts collide with the base and
+with each other, also with the part they hang on, which engines leave out unless asked.
 """
 
 from __future__ import annotations
@@ -52,8 +53,9 @@ class JointFacts:
 
 @dataclass(frozen=True)
 class EngineResult:
-    """reached: of each joint, the lowest and highest share of its range it got to (0 and 1 are its limits).  speed: the fastest joint's
-    after two seconds under gravity, from each recorded state [rad/s or m/s].  missing: joints of twin.urdf that the engine lacks."""
+    """reached: of each joint, the lowest and highest share of its range it got to (0 and 1 are its limits).  speed: the
+    fastest joint's after two seconds under gravity, from each recorded state [rad/s or m/s].  missing: joints of
+    twin.urdf that the engine lacks."""
 
     engine: str
     reached: dict[str, tuple[float, float]]
@@ -71,7 +73,9 @@ class EngineResult:
         ]
         for state, speed in zip(("start", "end"), self.speed, strict=True):
             if speed > STILL:
-                out.append(f"from the {state} state a joint still moves at {speed:.3f} per s after {REST:g} s under gravity")
+                out.append(
+                    f"from the {state} state a joint still moves at {speed:.3f} per s after {REST:g} s under gravity"
+                )
         return out
 
     @property
@@ -82,7 +86,8 @@ class EngineResult:
 
 
 def joint_facts(urdf: Path) -> list[JointFacts]:
-    """The moving joints of a URDF; the recorded end is the limit that is not zero (the farther one, where the range was extended)."""
+    """The moving joints of a URDF; the recorded end is the limit that is not zero (the farther one, where the range was
+    extended)."""
     out = []
     for joint in ET.parse(urdf).getroot().findall("joint"):
         if joint.get("type") not in ("revolute", "prismatic"):
@@ -95,7 +100,8 @@ def joint_facts(urdf: Path) -> list[JointFacts]:
 
 
 def run_engine(name: str, engine: Engine, facts: list[JointFacts]) -> EngineResult:
-    """Sweep every joint, the others held in the recorded state that lets it go further, then let all lie from both recorded states."""
+    """Sweep every joint, the others held in the recorded state that lets it go further, then let all lie from both
+    recorded states."""
     order = [next(f for f in facts if f.name == n) for n in engine.names]
     missing = tuple(f.name for f in facts if f.name not in engine.names)
     end = np.array([f.end for f in order])
@@ -113,7 +119,8 @@ def run_engine(name: str, engine: Engine, facts: list[JointFacts]) -> EngineResu
 
 
 def _best_sweep(engine: Engine, facts: list[JointFacts], i: int, end: np.ndarray) -> tuple[float, float]:
-    """Of joint ``i`` with the others all at the start, all at the end, or one of them at the end, whichever lets it go farthest."""
+    """Of joint ``i`` with the others all at the start, all at the end, or one of them at the end, whichever lets it go
+    farthest."""
     single = [row for k, row in enumerate(np.eye(len(facts))) if k != i]
     best = (1.0, 0.0)
     for share in (np.zeros(len(facts)), np.ones(len(facts)), *single):
@@ -126,7 +133,8 @@ def _best_sweep(engine: Engine, facts: list[JointFacts], i: int, end: np.ndarray
 
 
 def _sweep(engine: Engine, joint: JointFacts, i: int, held: np.ndarray) -> tuple[float, float]:
-    """Lowest and highest share of the range that joint ``i`` gets to from ``held``, pushed to one end and then to the other."""
+    """Lowest and highest share of the range that joint ``i`` gets to from ``held``, pushed to one end and then to the
+    other."""
     span = max(joint.upper - joint.lower, 1e-9)
     place, low, high = held.copy(), 1.0, 0.0
     engine.put(place)
@@ -187,13 +195,18 @@ class PyBullet:
         from pybullet_utils.bullet_client import BulletClient
 
         self.p = BulletClient(pybullet.DIRECT)
-        flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT | pybullet.URDF_USE_INERTIA_FROM_FILE
+        flags = (
+            pybullet.URDF_USE_SELF_COLLISION
+            | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
+            | pybullet.URDF_USE_INERTIA_FROM_FILE
+        )
         self.body = self.p.loadURDF(str(folder / "twin.urdf"), useFixedBase=True, flags=flags)
         self.p.setTimeStep(STEP)
         infos = [self.p.getJointInfo(self.body, i) for i in range(self.p.getNumJoints(self.body))]
         moving = [info for info in infos if info[2] in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)]
         self.names, self.index = [info[1].decode() for info in moving], [info[0] for info in moving]
-        for info in moving:  # it reads a joint's friction and leaves it to its users; the motor of its own would brake every joint
+        # it reads a joint's friction and leaves it to its users; the motor of its own would brake every joint
+        for info in moving:
             self.p.setJointMotorControl2(self.body, info[0], pybullet.VELOCITY_CONTROL, targetVelocity=0, force=info[7])
 
     def gravity(self, on: bool) -> None:
@@ -217,8 +230,8 @@ class PyBullet:
 
 
 def load_in_sapien(path: Path):
-    """SAPIEN's scene, its PhysX on the CPU and the articulation of a URDF, its root fixed, without what it shows: drawing needs a Vulkan
-    device."""
+    """SAPIEN's scene, its PhysX on the CPU and the articulation of a URDF, its root fixed, without what it shows:
+    drawing needs a Vulkan device."""
     import tempfile
     import warnings
 

@@ -1,4 +1,5 @@
-"""What judges the files of an export: physics engines, readers and validators of the formats, whichever are installed."""
+"""What judges the files of an export: physics engines, readers and validators of the formats, whichever are
+installed."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ class Judged:
 
 @dataclass(frozen=True)
 class Validator:
-    """files: that it reads, the one it judges first.  run: takes the folder.  package: of Python that ``run`` imports; none for programs
-    of node.  there: whether it is installed.  how: it is installed."""
+    """files: that it reads, the one it judges first.  run: takes the folder.  package: of Python that ``run`` imports;
+    none for programs of node.  there: whether it is installed.  how: it is installed."""
 
     package: str
     files: tuple[str, ...]
@@ -56,7 +57,8 @@ def _simcheck(name: str) -> Callable[[Path], Judged]:
 
         report = simcheck.check(str(folder / name), thresholds={"engine_timeout": LONGEST})
         done = sum(r.status == "pass" for r in report.results)
-        late = [f for f in report.warnings if f.data.get("incomplete")]  # to simcheck a warning; but then its checks were not made
+        # to simcheck a warning; but then its checks were not made
+        late = [f for f in report.warnings if f.data.get("incomplete")]
         warned = "; ".join(f"warning, {f.check}: {f.message}" for f in report.warnings if f not in late)
         problems = tuple(f"{f.check}: {f.message}" for f in [*report.errors, *late])
         return Judged(problems, f"{done} checks pass{'; ' * bool(warned)}{warned}")
@@ -103,7 +105,8 @@ def _urdf_validator(folder: Path) -> Judged:
 
 @functools.cache
 def gltf_validator_path() -> str | None:
-    """Khronos' gltf-validator (an npm package) as node finds it: installed here, or for everyone (npm install -g). None without node."""
+    """Khronos' gltf-validator (an npm package) as node finds it: installed here, or for everyone (npm install -g). None
+    without node."""
     node, npm = shutil.which("node"), shutil.which("npm")
     if node is None:
         return None
@@ -128,8 +131,14 @@ def _gltf(name: str) -> Callable[[Path], Judged]:
             return Judged((" ".join(done.stderr.split())[:300],))
         told = [m for m in json.loads(done.stdout) if m["severity"] <= WRONG]
         issues = [m for m in told if not _unknown_splats(m)]
-        unknown = f"{len(told) - len(issues)} times that it does not know KHR_gaussian_splatting" if len(told) > len(issues) else ""
-        return Judged(tuple(sorted({f"{m['code']} at {m.get('pointer', '?')}: {m['message']}" for m in issues})), unknown)
+        unknown = (
+            f"{len(told) - len(issues)} times that it does not know KHR_gaussian_splatting"
+            if len(told) > len(issues)
+            else ""
+        )
+        return Judged(
+            tuple(sorted({f"{m['code']} at {m.get('pointer', '?')}: {m['message']}" for m in issues})), unknown
+        )
 
     return run
 

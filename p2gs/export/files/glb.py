@@ -33,11 +33,16 @@ class Buffer:
     def add_bytes(self, content: bytes, target: int | None = None) -> int:
         """Index of the new view."""
         self.data += b"\0" * (-len(self.data) % 4)
-        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)} | ({"target": target} if target else {}))
+        self.views.append(
+            {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)}
+            | ({"target": target} if target else {})
+        )
         self.data += content
         return len(self.views) - 1
 
-    def add(self, values: np.ndarray, kind: str, component: int, target: int | None = None, normalized: bool = False) -> int:
+    def add(
+        self, values: np.ndarray, kind: str, component: int, target: int | None = None, normalized: bool = False
+    ) -> int:
         """Index of the new accessor."""
         view = self.add_bytes(np.ascontiguousarray(values).tobytes(), target)
         accessor = {"bufferView": view, "componentType": component, "count": len(values), "type": kind}
@@ -64,7 +69,10 @@ def glb_bytes(asset: Asset) -> bytes:
     textured = [link for link in asset.links if link.texture is not None]
     document: dict = {}
     if textured:  # read between texels, but from no smaller copies, in which neighbours run together
-        images = [{"bufferView": buffer.add_bytes(link.texture.png()), "mimeType": "image/png", "name": link.name} for link in textured]
+        images = [
+            {"bufferView": buffer.add_bytes(link.texture.png()), "mimeType": "image/png", "name": link.name}
+            for link in textured
+        ]
         document |= {"images": images, "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR}]}
         document["textures"] = [{"source": i, "sampler": 0} for i in range(len(images))]
     number = {link.name: i for i, link in enumerate(textured)}
@@ -84,7 +92,9 @@ def animated_glb(asset: Asset, buffer: Buffer, meshes: list[dict], document: dic
     nodes: list[dict] = [{"name": asset.name, "children": list(range(1, len(asset.links) + 1))}]
     number = {mesh["name"]: {"mesh": i} for i, mesh in enumerate(meshes)}
     for link in asset.links:
-        nodes.append({"name": link.name, "translation": link.origin.tolist()} | number.get(link.name, {}) | _extras(link))
+        nodes.append(
+            {"name": link.name, "translation": link.origin.tolist()} | number.get(link.name, {}) | _extras(link)
+        )
     samplers, channels = [], []
     times = np.linspace(0, SECONDS, 9, dtype=np.float32)
     clock = buffer.add(times, "SCALAR", FLOAT) if asset.moving else -1
@@ -148,7 +158,13 @@ def _extras(link: Link) -> dict:
     extras: dict = {"colour": list(part_colour(link.part))} | ({"label": link.label} if link.label else {})
     if h is None:
         return {"extras": extras}
-    joint = {"type": h.type, "axis": h.axis.tolist(), "origin": h.origin.tolist(), "motion": h.motion, "limits": [h.lower, h.upper]}
+    joint = {
+        "type": h.type,
+        "axis": h.axis.tolist(),
+        "origin": h.origin.tolist(),
+        "motion": h.motion,
+        "limits": [h.lower, h.upper],
+    }
     return {"extras": extras | {"joint": joint}}
 
 

@@ -15,11 +15,14 @@ GRAVITY = {"z": (0, 0, -9.81), "y": (0, -9.81, 0), "x": (-9.81, 0, 0)}
 
 
 def write_mjcf(asset: Asset, out: Path) -> Path:
-    """OUT/twin.xml and OUT/assets. The base stands fixed in the world unless it is to float; joint names are those of the URDF."""
+    """OUT/twin.xml and OUT/assets. The base stands fixed in the world unless it is to float; joint names are those of
+    the URDF."""
     write_assets(asset, out)
     root = ET.Element("mujoco", model=asset.name)
     ET.SubElement(root, "compiler", angle="radian", meshdir=FOLDER, texturedir=FOLDER, autolimits="true")
-    option = ET.SubElement(root, "option", timestep="0.002", integrator="implicitfast", gravity=numbers(GRAVITY[asset.up]))
+    option = ET.SubElement(
+        root, "option", timestep="0.002", integrator="implicitfast", gravity=numbers(GRAVITY[asset.up])
+    )
     if asset.fixed is False:  # where the base moves, MuJoCo lets parts pass through it unless told
         ET.SubElement(option, "flag", filterparent="disable")
     _defaults(root)
@@ -41,7 +44,9 @@ def write_mjcf(asset: Asset, out: Path) -> Path:
     for link in asset.moving:
         _body(base, link)
         reach = numbers((-link.joint.effort, link.joint.effort))
-        ET.SubElement(actuator, "motor", name=f"motor_{link.part}", joint=f"joint_{link.part}", gear="1", ctrlrange=reach)
+        ET.SubElement(
+            actuator, "motor", name=f"motor_{link.part}", joint=f"joint_{link.part}", gear="1", ctrlrange=reach
+        )
     path = out / "twin.xml"
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n")
@@ -62,15 +67,27 @@ def _body(parent: ET.Element, link: Link) -> ET.Element:
     body = ET.SubElement(parent, "body", name=link.name, pos=numbers(link.origin))
     m = link.inertia.matrix
     full = (m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
-    ET.SubElement(body, "inertial", pos=numbers(link.inertia.center), mass=number(link.inertia.mass), fullinertia=numbers(full))
+    ET.SubElement(
+        body, "inertial", pos=numbers(link.inertia.center), mass=number(link.inertia.mass), fullinertia=numbers(full)
+    )
     if link.joint is not None:
         hinge = link.joint
         kind = "hinge" if hinge.type == "revolute" else "slide"
         weight = effective_inertia(link.inertia, hinge.axis) if kind == "hinge" else link.inertia.mass
         joint = ET.SubElement(
-            body, "joint", {"class": "joint"}, name=f"joint_{link.part}", type=kind, pos="0 0 0", axis=numbers(hinge.axis)
+            body,
+            "joint",
+            {"class": "joint"},
+            name=f"joint_{link.part}",
+            type=kind,
+            pos="0 0 0",
+            axis=numbers(hinge.axis),
         )
-        joint.attrib |= {"range": numbers((hinge.lower, hinge.upper)), "damping": number(hinge.damping), "armature": number(0.01 * weight)}
+        joint.attrib |= {
+            "range": numbers((hinge.lower, hinge.upper)),
+            "damping": number(hinge.damping),
+            "armature": number(0.01 * weight),
+        }
         joint.attrib["frictionloss"] = number(hinge.friction)
     look = {"rgba": numbers((*link.colour, 1.0))} if link.texture is None else {"material": link.name}
     ET.SubElement(body, "geom", {"class": "visual"} | look, mesh=link.name)

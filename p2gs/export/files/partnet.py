@@ -1,8 +1,9 @@
-"""The layout of PartNet-Mobility, which SAPIEN, ManiSkill and programs written for that data set read: Y up, a link a part, labels.
+"""The layout of PartNet-Mobility, which SAPIEN, ManiSkill and programs written for that data set read: Y up, a link a
+part, labels.
 
-After Xiang et al. 2020 (SAPIEN, arXiv 2003.08515) and the published objects: mobility.urdf whose root ``base`` turns Y to Z,
-textured_objs/, mobility_v2.json, semantics.txt, result.json (tree of parts), bounding_box.json, meta.json. Textures lie beside the OBJ
-files (the data set's in images/), where readers that take no path upwards find them too.
+After Xiang et al. 2020 (SAPIEN, arXiv 2003.08515) and the published objects: mobility.urdf whose root ``base`` turns Y
+to Z, textured_objs/, mobility_v2.json, semantics.txt, result.json (tree of parts), bounding_box.json, meta.json.
+Textures lie beside the OBJ files (the data set's in images/), where readers that take no path upwards find them too.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from p2gs.export.links import Link
 
 OBJS, PIECES = "textured_objs", "collision_objs"
 UPRIGHT = (np.pi / 2, 0.0, -np.pi / 2)  # of the object in ``base``: Y to Z, its front (Z) to -X
-JOINTS: dict[Optional[str], str] = {"revolute": "hinge", "prismatic": "slider", None: "heavy"}  # the data set's words; a root may be free
+# the data set's words; a root may be free
+JOINTS: dict[Optional[str], str] = {"revolute": "hinge", "prismatic": "slider", None: "heavy"}
 
 
 def write_partnet(asset: Asset, out: Path, meta: Mapping[str, object]) -> list[Path]:
-    """The files of one object in OUT. The asset has Y up and labelled links; moving ones become link_0, link_1, ..., the base the last.
+    """The files of one object in OUT. The asset has Y up and labelled links; moving ones become link_0, link_1, ...,
+    the base the last.
 
     meta: of the user; ``category`` becomes model_cat.
     """
@@ -51,7 +54,12 @@ def write_partnet(asset: Asset, out: Path, meta: Mapping[str, object]) -> list[P
     points = np.concatenate([link.visual.vertices + link.origin for link in asset.links])
     box = {"min": points.min(0).tolist(), "max": points.max(0).tolist()}
     category = str(meta.get("category", "Object"))
-    tree = {"id": 0, "name": category.lower(), "text": category, "children": [_leaf(link, number[link.name]) for link in order]}
+    tree = {
+        "id": 0,
+        "name": category.lower(),
+        "text": category,
+        "children": [_leaf(link, number[link.name]) for link in order],
+    }
     files = {
         "mobility_v2.json": [_entry(link, number[link.name], len(order) - 1, kinds) for link in order],
         "result.json": [tree],
@@ -98,5 +106,14 @@ def _entry(link: Link, i: int, root: int, kinds: Mapping[Optional[str], str]) ->
         return entry | {"parent": -1, "jointData": {}}
     turns = hinge.type == "revolute"
     lower, upper = np.degrees([hinge.lower, hinge.upper]) if turns else (hinge.lower, hinge.upper)
-    limit = {"a": float(upper), "b": float(lower), "noLimit": False, "rotates": False, "noRotationLimit": True, "rotationLimit": ""}
-    return entry | {"jointData": {"axis": {"origin": hinge.origin.tolist(), "direction": hinge.axis.tolist()}, "limit": limit}}
+    limit = {
+        "a": float(upper),
+        "b": float(lower),
+        "noLimit": False,
+        "rotates": False,
+        "noRotationLimit": True,
+        "rotationLimit": "",
+    }
+    return entry | {
+        "jointData": {"axis": {"origin": hinge.origin.tolist(), "direction": hinge.axis.tolist()}, "limit": limit}
+    }

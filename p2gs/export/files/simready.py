@@ -1,6 +1,7 @@
 """NVIDIA's SimReady packaging of a twin: NAME/usd/NAME.usda with labels, metadata, textures and a thumbnail.
 
-After the requirements NP.005 (folders), SR.001 to SR.004 (metadata, thumbnail) and SL.* (labels) of SimReady Foundation 2026.08.
+After the requirements NP.005 (folders), SR.001 to SR.004 (metadata, thumbnail) and SL.* (labels) of SimReady Foundation
+2026.08.
 """
 
 from __future__ import annotations
@@ -19,10 +20,13 @@ FOLDER = "usd"  # the one between the asset's folder and its file
 THUMBNAIL = 256  # pixels a side
 
 
-def write_simready(asset: Asset, out: Path, meta: Mapping[str, object], source: Path, picture: Optional[Path]) -> list[Path]:
+def write_simready(
+    asset: Asset, out: Path, meta: Mapping[str, object], source: Path, picture: Optional[Path]
+) -> list[Path]:
     """OUT/NAME/usd/NAME.usda and its thumbnail; NAME is the metadata's ``asset_name``, else the twin's.
 
-    meta: of the user, over what is known here.  source: that the twin was made from.  picture: for the thumbnail, if there is one.
+    meta: of the user, over what is known here.  source: that the twin was made from.  picture: for the thumbnail, if
+    there is one.
     """
     name = file_name(str(meta.get("asset_name", asset.name)))
     folder = out / name / FOLDER
@@ -41,7 +45,9 @@ def write_simready(asset: Asset, out: Path, meta: Mapping[str, object], source: 
         labels.append(("wikidata_qcode", str(told["qcode"])))
     written = [write_usd(asset, folder, name, data, labels)]
     if picture is not None:
-        written.append(write_thumbnail(picture, folder / ".thumbs" / f"{THUMBNAIL}x{THUMBNAIL}" / f"{written[0].name}.png"))
+        written.append(
+            write_thumbnail(picture, folder / ".thumbs" / f"{THUMBNAIL}x{THUMBNAIL}" / f"{written[0].name}.png")
+        )
     return written
 
 

@@ -1,7 +1,8 @@
 """splats.glb: the Gaussians themselves, one animated node a part, by glTF's extension KHR_gaussian_splatting.
 
-After the ratified text (github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting): scale is linear, opacity between 0
-and 1, rotation xyzw, coefficients of the spherical harmonics as 3DGS has them; a reader that does not know it shows coloured points.
+After the ratified text (github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting): scale is linear,
+opacity between 0 and 1, rotation xyzw, coefficients of the spherical harmonics as 3DGS has them; a reader that does not
+know it shows coloured points.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ POINTS = 0  # mode of a primitive
 def write_splats(asset: Asset, out: Path) -> Path:
     """OUT/splats.glb. Nodes and animation are those of twin.glb."""
     buffer = Buffer()
-    meshes = [_mesh(buffer, link.name, link.splats) for link in asset.links if link.splats is not None and len(link.splats)]
+    meshes = [
+        _mesh(buffer, link.name, link.splats) for link in asset.links if link.splats is not None and len(link.splats)
+    ]
     path = out / "splats.glb"
     path.write_bytes(animated_glb(asset, buffer, meshes, {"extensionsUsed": [EXTENSION]}))
     return path
@@ -46,5 +49,10 @@ def _mesh(buffer: Buffer, name: str, g: GaussianTensors) -> dict:
         for n in range(2 * degree + 1):
             values = np.ascontiguousarray(sh[:, degree * degree + n])
             attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}"] = buffer.add(values, "VEC3", FLOAT, ARRAY_BUFFER)
-    how = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "sortingMethod": "cameraDistance", "projection": "perspective"}
+    how = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "sortingMethod": "cameraDistance",
+        "projection": "perspective",
+    }
     return {"name": name, "primitives": [{"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: how}}]}

@@ -1,9 +1,9 @@
 """splats.spz: the Gaussians at the start state in Niantic's compressed format, a fifth of the PLY's size.
 
-Version 3 of the format after its description (github.com/nianticlabs/spz, README): gzip over a header of 16 bytes and one block each of
-positions (24-bit fixed point), opacities, colours, logarithms of scales (8 bits each), rotations (the three smaller components of the
-quaternion, 10 bits each, and which is left out) and the higher coefficients of the spherical harmonics (8 bits each). Axes are those of
-OpenGL: x right, y up, z back.
+Version 3 of the format after its description (github.com/nianticlabs/spz, README): gzip over a header of 16 bytes and
+one block each of positions (24-bit fixed point), opacities, colours, logarithms of scales (8 bits each), rotations (the
+three smaller components of the quaternion, 10 bits each, and which is left out) and the higher coefficients of the
+spherical harmonics (8 bits each). Axes are those of OpenGL: x right, y up, z back.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ COLOUR = 0.15  # share of a byte's range for one unit of the constant coefficien
 def write_spz(asset: Asset, out: Path) -> Path:
     """OUT/splats.spz, of all parts."""
     links = [link for link in asset.links if link.splats is not None]
-    moved = [link.splats.placed(link.splats.means + torch.from_numpy(link.origin).float(), link.splats.quats) for link in links]
+    moved = [
+        link.splats.placed(link.splats.means + torch.from_numpy(link.origin).float(), link.splats.quats)
+        for link in links
+    ]
     path = out / "splats.spz"
     path.write_bytes(spz_bytes(GaussianTensors.cat(moved)))
     return path
@@ -36,7 +39,9 @@ def write_spz(asset: Asset, out: Path) -> Path:
 
 def spz_bytes(gaussians: GaussianTensors) -> bytes:
     """The file's content."""
-    means, quats, log_scales, logits, sh = (getattr(gaussians, n).detach().cpu().double().numpy() for n in GaussianTensors.NAMES)
+    means, quats, log_scales, logits, sh = (
+        getattr(gaussians, n).detach().cpu().double().numpy() for n in GaussianTensors.NAMES
+    )
     bits = _fraction(float(np.abs(means).max(initial=0.0)))
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), degree_of(sh.shape[1]), bits, 0, 0)
     fixed = np.round(means * 2.0**bits).astype("<i4")
@@ -62,7 +67,8 @@ def _byte(values: np.ndarray) -> np.ndarray:
 
 
 def _smallest_three(quats: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz [N, 4] as words [N] of 32 bits: index of the largest component (of xyzw), then sign and 9 bits of each other."""
+    """Quaternions wxyz [N, 4] as words [N] of 32 bits: index of the largest component (of xyzw), then sign and 9 bits
+    of each other."""
     q = (quats / np.linalg.norm(quats, axis=1, keepdims=True))[:, [1, 2, 3, 0]]
     rows, largest = np.arange(len(q)), np.abs(q).argmax(1)
     q = q * np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]

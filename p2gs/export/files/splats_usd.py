@@ -1,4 +1,5 @@
-"""The Gaussians of a part as a ParticleField3DGaussianSplat prim (UsdVol, OpenUSD 26.03 and later), for a stage written as text."""
+"""The Gaussians of a part as a ParticleField3DGaussianSplat prim (UsdVol, OpenUSD 26.03 and later), for a stage written
+as text."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ REACH = 3.0  # standard deviations: as far as renderers draw a Gaussian, for the
 
 
 def splat_prim(g: GaussianTensors, indent: str) -> list[str]:
-    """Lines of the prim "splats": scales linear, opacities between 0 and 1, orientations wxyz, coefficients grouped by Gaussian."""
+    """Lines of the prim "splats": scales linear, opacities between 0 and 1, orientations wxyz, coefficients grouped by
+    Gaussian."""
     means, scales = g.means.double().numpy(), g.log_scales.double().exp().numpy()
     quats = torch.nn.functional.normalize(g.quats.double(), dim=-1)
     R = quat_to_matrix(quats).numpy()
@@ -35,7 +37,12 @@ def splat_prim(g: GaussianTensors, indent: str) -> list[str]:
         f"float3[] extent = {_tuples(extent, 9)}",
         'uniform token sortingModeHint = "cameraDistance"',
     ]
-    return [f'{indent}def ParticleField3DGaussianSplat "splats"', indent + "{", *(f"{indent}    {r}" for r in rows), indent + "}"]
+    return [
+        f'{indent}def ParticleField3DGaussianSplat "splats"',
+        indent + "{",
+        *(f"{indent}    {r}" for r in rows),
+        indent + "}",
+    ]
 
 
 def _tuples(rows: Iterable, digits: int) -> str:

@@ -1,4 +1,5 @@
-"""URDF: a link per part, a joint per moving part, zero at the start state; visual and convex collision meshes, limits, inertia, damping."""
+"""URDF: a link per part, a joint per moving part, zero at the start state; visual and convex collision meshes, limits,
+inertia, damping."""
 
 from __future__ import annotations
 
@@ -17,8 +18,9 @@ WORLD = "world"
 def write_urdf(asset: Asset, out: Path, mujoco: bool = True) -> Path:
     """OUT/twin.urdf and OUT/assets. Mesh paths are relative to the file, which every reader resolves.
 
-    mujoco: with the element of MuJoCo's own that tells it where the meshes are; some readers warn of it.  A fixed base hangs on a link
-    ``world``, which readers that know no such option of their own need; by default and floating it is the root.
+    mujoco: with the element of MuJoCo's own that tells it where the meshes are; some readers warn of it.  A fixed base
+    hangs on a link ``world``, which readers that know no such option of their own need; by default and floating it is
+    the root.
     """
     write_assets(asset, out)
     robot = ET.Element("robot", name=asset.name)
@@ -60,7 +62,9 @@ def _link(robot: ET.Element, link: Link) -> None:
         _mesh(ET.SubElement(element, "collision"), collision_name(link, i))
 
 
-def fixed_joint(robot: ET.Element, name: str, parent: str, child: str, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+def fixed_joint(
+    robot: ET.Element, name: str, parent: str, child: str, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> None:
     """A joint that does not move, both links' origins in one place."""
     joint = ET.SubElement(robot, "joint", name=name, type="fixed")
     ET.SubElement(joint, "parent", link=parent)

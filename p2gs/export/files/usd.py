@@ -1,4 +1,5 @@
-"""USD as text (.usda), written without a library: meshes with colours, rigid bodies, UsdPhysics joints with limits and damping."""
+"""USD as text (.usda), written without a library: meshes with colours, rigid bodies, UsdPhysics joints with limits and
+damping."""
 
 from __future__ import annotations
 
@@ -22,12 +23,17 @@ Value = Union[str, int, float, Sequence[float], Mapping[str, "Value"]]  # of lay
 
 
 def write_usd(
-    asset: Asset, out: Path, name: str = "twin", data: Optional[Mapping[str, Value]] = None, labels: Sequence[tuple] = ()
+    asset: Asset,
+    out: Path,
+    name: str = "twin",
+    data: Optional[Mapping[str, Value]] = None,
+    labels: Sequence[tuple] = (),
 ) -> Path:
-    """OUT/<name>.usda, metres, up axis Y or Z as asked for. Raises UserError for x, which USD does not know as an up axis.
+    """OUT/<name>.usda, metres, up axis Y or Z as asked for. Raises UserError for x, which USD does not know as an up
+    axis.
 
-    Links that have splats get them as a prim each.  data: the layer's own metadata (customLayerData).  labels: (taxonomy, label) pairs of
-    the whole object.
+    Links that have splats get them as a prim each.  data: the layer's own metadata (customLayerData).  labels:
+    (taxonomy, label) pairs of the whole object.
     """
     if asset.up == "x":
         raise UserError("--up is 'x', but a USD stage stands on y or z: give --up y or --up z")
@@ -52,7 +58,12 @@ def write_usd(
             link.texture.save(_texture(out, link))
             lines += _material(link, asset.material if link.label else "")
     if asset.fixed is not False:
-        lines += ['    def PhysicsFixedJoint "fix_base"', "    {", f"        rel physics:body1 = </twin/{asset.links[0].name}>", "    }"]
+        lines += [
+            '    def PhysicsFixedJoint "fix_base"',
+            "    {",
+            f"        rel physics:body1 = </twin/{asset.links[0].name}>",
+            "    }",
+        ]
     for link in asset.moving:
         lines += _joint(link, asset.links[0].name)
     path = out / f"{name}.usda"
@@ -61,7 +72,8 @@ def write_usd(
 
 
 def layer_data(data: Mapping[str, Value], depth: int = 1, head: str = "customLayerData = {") -> list[str]:
-    """Lines of a dictionary in a layer's metadata: strings, whole numbers, floats, triples of floats, dictionaries of these."""
+    """Lines of a dictionary in a layer's metadata: strings, whole numbers, floats, triples of floats, dictionaries of
+    these."""
     indent, lines = "    " * depth, []
     for key, value in data.items():
         if isinstance(value, Mapping):
@@ -76,7 +88,8 @@ def layer_data(data: Mapping[str, Value], depth: int = 1, head: str = "customLay
 
 
 def _contact(label: str) -> list[str]:
-    """The physics material of all collision pieces, labelled by what the object is made of, if it is labelled at all."""
+    """The physics material of all collision pieces, labelled by what the object is made of, if it is labelled at
+    all."""
     schemas = ["PhysicsMaterialAPI", *(["SemanticsLabelsAPI:material"] if label else [])]
     return [
         f'    def Material "contact" (prepend apiSchemas = {json.dumps(schemas)})',
@@ -101,9 +114,17 @@ def _link(link: Link) -> list[str]:
         f"        quatf physics:principalAxes = {_tuple(rotation)}",
     ]
     visual = link.visual
-    look = [f"color3f[] primvars:displayColor = {_array(visual.colours / 255, 4)} (", '    interpolation = "vertex"', ")"]
+    look = [
+        f"color3f[] primvars:displayColor = {_array(visual.colours / 255, 4)} (",
+        '    interpolation = "vertex"',
+        ")",
+    ]
     if link.texture is not None:
-        look += [f"texCoord2f[] primvars:st = {_array(link.texture.uv.reshape(-1, 2), 7)} (", '    interpolation = "faceVarying"', ")"]
+        look += [
+            f"texCoord2f[] primvars:st = {_array(link.texture.uv.reshape(-1, 2), 7)} (",
+            '    interpolation = "faceVarying"',
+            ")",
+        ]
         look += [f"rel material:binding = </twin/{link.name}_look>"]
     schemas = [] if link.texture is None else ["MaterialBindingAPI"]
     if link.label:
@@ -129,7 +150,8 @@ def _texture(out: Path, link: Link) -> Path:
 def _material(link: Link, label: str) -> list[str]:
     here = f"/twin/{link.name}_look"
     return [
-        f'    def Material "{link.name}_look"' + (' (prepend apiSchemas = ["SemanticsLabelsAPI:material"])' if label else ""),
+        f'    def Material "{link.name}_look"'
+        + (' (prepend apiSchemas = ["SemanticsLabelsAPI:material"])' if label else ""),
         "    {",
         *([f'        token[] semantics:labels:material = ["{label}"]'] if label else []),
         f"        token outputs:surface.connect = <{here}/surface.outputs:surface>",
@@ -161,7 +183,8 @@ def _material(link: Link, label: str) -> list[str]:
 def _mesh(name: str, vertices: np.ndarray, faces: np.ndarray, extra: list[str], schemas: list[str]) -> list[str]:
     rows = [
         f"point3f[] points = {_array(vertices, 7)}",
-        f"float3[] extent = {_array(np.array([vertices.min(0), vertices.max(0)]), 7)}",  # of the points as they are written
+        # of the points as they are written
+        f"float3[] extent = {_array(np.array([vertices.min(0), vertices.max(0)]), 7)}",
         f"normal3f[] normals = {_array(vertex_normals(vertices, faces), 4)} (",
         '    interpolation = "vertex"',
         ")",
@@ -180,7 +203,8 @@ def _joint(link: Link, base: str) -> list[str]:
     kind = "Revolute" if h.type == "revolute" else "Prismatic"
     lo, hi = np.degrees([h.lower, h.upper]) if kind == "Revolute" else (h.lower, h.upper)
     turn = _tuple(x_to(h))
-    drive, damping = ("angular", h.damping * math.pi / 180) if kind == "Revolute" else ("linear", h.damping)  # angular: per degree / s
+    # angular: per degree / s
+    drive, damping = ("angular", h.damping * math.pi / 180) if kind == "Revolute" else ("linear", h.damping)
     return [
         f'    def Physics{kind}Joint "joint_{link.part}" (prepend apiSchemas = ["PhysicsDriveAPI:{drive}"])',
         "    {",

@@ -20,7 +20,8 @@ STATES = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def chosen_camera(obj: ArticulatedObject, cameras: Sequence[Camera]) -> tuple[Camera, int]:
-    """The camera for pictures and its index; without cameras one of an orbit (index -1). ``obj`` in the cameras' coordinates."""
+    """The camera for pictures and its index; without cameras one of an orbit (index -1). ``obj`` in the cameras'
+    coordinates."""
     if cameras:
         index = best_camera(obj, cameras)
         return cameras[index], index
@@ -28,7 +29,9 @@ def chosen_camera(obj: ArticulatedObject, cameras: Sequence[Camera]) -> tuple[Ca
     return ring[best_camera(obj, ring)], -1
 
 
-def framed(obj: ArticulatedObject, camera: Camera, size: int, margin: float = 0.08) -> tuple[Camera, tuple[int, int, int, int]]:
+def framed(
+    obj: ArticulatedObject, camera: Camera, size: int, margin: float = 0.08
+) -> tuple[Camera, tuple[int, int, int, int]]:
     """The camera cut to a window around the object in all states and scaled to ``size`` px on its longer side.
 
     Returns the camera and the window (x, y, width, height) in pixels of the given camera.
@@ -58,12 +61,14 @@ def render_parts(obj: ArticulatedObject, camera: Camera, t: float, joints: bool 
     return draw_joints(image, obj, camera, t, out.expected_depth, out.alpha) if joints else image
 
 
-def write_media(obj: ArticulatedObject, media_dir: Path, cameras: Sequence[Camera], photos=None, size: int = 512) -> list[Path]:
+def write_media(
+    obj: ArticulatedObject, media_dir: Path, cameras: Sequence[Camera], photos=None, size: int = 512
+) -> list[Path]:
     """All still pictures of a run. ``obj`` and ``cameras`` in the same coordinates.
 
-    photos(state) -> (uint8 image, the camera it was taken with), or None. Writes {start,end}.png (plain), parts_{start,end}.png
-    (part colours, joints), parts_t000.png ... parts_t100.png, states.png (those five in a row) and compare.png (photograph,
-    render and parts for both states).
+    photos(state) -> (uint8 image, the camera it was taken with), or None. Writes {start,end}.png (plain),
+    parts_{start,end}.png (part colours, joints), parts_t000.png ... parts_t100.png, states.png (those five in a row)
+    and compare.png (photograph, render and parts for both states).
     """
     media_dir.mkdir(parents=True, exist_ok=True)
     base, _ = chosen_camera(obj, cameras)
@@ -86,13 +91,16 @@ def write_media(obj: ArticulatedObject, media_dir: Path, cameras: Sequence[Camer
 
 
 def _compare_row(obj, state: int, camera: Camera, size: int, photos) -> np.ndarray:
-    """Photograph (where there is one), twin and parts of a state, all from the photograph's camera and as large as ``camera``."""
+    """Photograph (where there is one), twin and parts of a state, all from the photograph's camera and as large as
+    ``camera``."""
     t, name, cells = float(state), ("start", "end")[state], []
     shape = camera.width, camera.height + CAPTION
     if photos is not None:
         photo, taken = photos(state)
         camera, (x, y, w, h) = framed(obj, taken, size)
-        cells.append(captioned(resize(photo[y : y + h, x : x + w], camera.width, camera.height), f"photograph ({name})"))
+        cells.append(
+            captioned(resize(photo[y : y + h, x : x + w], camera.width, camera.height), f"photograph ({name})")
+        )
     cells.append(captioned(render_plain(obj, camera, t), f"twin ({name})"))
     cells.append(captioned(render_parts(obj, camera, t), f"parts and joints ({name})"))
     return beside([fit(c, *shape) for c in cells])
@@ -160,7 +168,8 @@ def save_png(path: Path, image: np.ndarray) -> None:
 
 
 def scene_photos(scene: TwoStateScene, obj: ArticulatedObject):
-    """For ``write_media``: a function that gives the best-chosen photograph of a state with its camera, in input coordinates."""
+    """For ``write_media``: a function that gives the best-chosen photograph of a state with its camera, in input
+    coordinates."""
     from p2gs.gaussians.views import scene_cameras
 
     obj = object_to_input(obj)

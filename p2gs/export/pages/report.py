@@ -21,7 +21,8 @@ CURVE_COLOURS = ("#e07010", "#1a80d8", "#1aa672", "#d84088", "#8058cc", "#c9a020
 
 
 def write_report(run_dir: Path | str) -> Path:
-    """The page: mesh and splats in 3D with a slider per joint, pictures, joints, scores, losses, times. What the run lacks is left out.
+    """The page: mesh and splats in 3D with a slider per joint, pictures, joints, scores, losses, times. What the run
+    lacks is left out.
 
     The 3D view needs RUN/meshes (made by ``write_meshes``); scores need RUN/metrics.json, which ``p2gs test`` writes.
     Raises UserError for a run without a twin.
@@ -56,7 +57,10 @@ def write_report(run_dir: Path | str) -> Path:
 def picture_section(run_dir: Path) -> str:
     """Photographs beside renders, and the states between."""
     rows = []
-    told = {"compare": "Photograph, twin, parts and joints: start state above, end state below.", "states": "From start to end."}
+    told = {
+        "compare": "Photograph, twin, parts and joints: start state above, end state below.",
+        "states": "From start to end.",
+    }
     for name, text in told.items():
         path = run_dir / "media" / f"{name}.png"
         if path.is_file():
@@ -81,12 +85,22 @@ def joint_section(obj: ArticulatedObject, metrics: Optional[dict]) -> str:
             revolute = j.type == "revolute"
             reach = f"{j.motion:.1f}&deg;" if revolute else f"{j.motion:.3f}"
             through = _vector(j.origin) if revolute else ""
-            cells = [f"{chip(part.id)}{part.id}", j.type, _vector(j.axis), through, reach, f"{part.confidence:.2f}", f"{count:,}"]
+            cells = [
+                f"{chip(part.id)}{part.id}",
+                j.type,
+                _vector(j.axis),
+                through,
+                reach,
+                f"{part.confidence:.2f}",
+                f"{count:,}",
+            ]
             if joints:
                 e = errors.get(moving)
                 unit = "&deg;" if revolute else ""
                 cells += (
-                    ["F"] * 3 if e is None else [f"{e['axis_angle']:.3f}&deg;", _number(e["axis_position"]), f"{e['motion']:.4f}{unit}"]
+                    ["F"] * 3
+                    if e is None
+                    else [f"{e['axis_angle']:.3f}&deg;", _number(e["axis_position"]), f"{e['motion']:.4f}{unit}"]
                 )
             moving += 1
         rows.append(cells)
@@ -110,7 +124,12 @@ def score_section(metrics: Optional[dict]) -> str:
     views = metrics.get("views") or {}
     if views:
         depth = any("depth_median" in v for v in views.values())
-        columns = {"psnr_white": "PSNR on white", "psnr_black": "on black", "ssim_white": "SSIM", "psnr_masked": "PSNR of the object"}
+        columns = {
+            "psnr_white": "PSNR on white",
+            "psnr_black": "on black",
+            "ssim_white": "SSIM",
+            "psnr_masked": "PSNR of the object",
+        }
         columns |= {"lpips": "LPIPS"} if any("lpips" in v for v in views.values()) else {}
         columns |= {"depth_median": "depth error, median", "depth_p90": "90 %"} if depth else {}
         keys, head = list(columns), ["state", "views", *columns.values()]
@@ -130,7 +149,11 @@ def curve_section(logs: Path) -> str:
     """Losses by step, a chart per training stage, from TensorBoard's files."""
     charts = []
     for folder in sorted(p for p in logs.iterdir() if p.is_dir()) if logs.is_dir() else []:
-        curves = {tag.split("/")[-1]: points for tag, points in read_scalars(folder).items() if is_loss(tag) and len(points) > 1}
+        curves = {
+            tag.split("/")[-1]: points
+            for tag, points in read_scalars(folder).items()
+            if is_loss(tag) and len(points) > 1
+        }
         if curves:
             charts.append(f"<h3>{html.escape(folder.name.replace('_', ' '))}</h3>\n{chart(curves)}")
     return "<h2>Losses</h2>\n" + "\n".join(charts) if charts else ""
@@ -138,11 +161,16 @@ def curve_section(logs: Path) -> str:
 
 def is_loss(tag: str) -> bool:
     """Scalars are logged as stage/name; summaries have more levels or are counts."""
-    return tag.count("/") <= 2 and ("loss" in tag or tag.count("/") == 1) and tag.split("/")[-1] not in ("gaussians", "parts")
+    return (
+        tag.count("/") <= 2
+        and ("loss" in tag or tag.count("/") == 1)
+        and tag.split("/")[-1] not in ("gaussians", "parts")
+    )
 
 
 def read_scalars(folder: Path) -> dict[str, np.ndarray]:
-    """tag -> [n, 2] (step, value), steps rising: where a stage was run again, what is newer replaces the older from its step on."""
+    """tag -> [n, 2] (step, value), steps rising: where a stage was run again, what is newer replaces the older from its
+    step on."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(folder), size_guidance={"scalars": 2000})
@@ -183,7 +211,9 @@ def chart(curves: dict[str, np.ndarray], width: int = 640, height: int = 180) ->
         thin = points[:: max(1, len(points) // 200)]
         parts.append(f'<path d="M{"L".join(xy(p) for p in thin)}" stroke="{colour}"/>')
         if 16 + 14 * i < height - 8:
-            parts.append(f'<text x="{width - right + 8}" y="{16 + 14 * i}" style="fill:{colour}">{html.escape(name)}</text>')
+            parts.append(
+                f'<text x="{width - right + 8}" y="{16 + 14 * i}" style="fill:{colour}">{html.escape(name)}</text>'
+            )
     parts.append(f'<text x="{width - right}" y="{height - 6}" text-anchor="end">{last:.0f} steps</text></svg>')
     return "".join(parts)
 
@@ -192,14 +222,20 @@ def time_section(stages: Optional[dict]) -> str:
     """Seconds and memory of each stage."""
     if not stages:
         return ""
-    rows = [[html.escape(k.replace("_", " ")), f"{v['seconds']:.1f}", f"{v['peak_memory_mib']:,}"] for k, v in stages.items()]
+    rows = [
+        [html.escape(k.replace("_", " ")), f"{v['seconds']:.1f}", f"{v['peak_memory_mib']:,}"]
+        for k, v in stages.items()
+    ]
     rows.append(["all", f"{wall_seconds(stages):.1f}", ""])
     return "<h2>Time</h2>\n" + table(["stage", "seconds", "peak memory [MiB]"], rows)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Cells are HTML already."""
-    body = "".join("<tr>" + "".join(f'<td class="bad">{c}</td>' if c == "F" else f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
+    body = "".join(
+        "<tr>" + "".join(f'<td class="bad">{c}</td>' if c == "F" else f"<td>{c}</td>" for c in row) + "</tr>"
+        for row in rows
+    )
     return f'<div class="scroll"><table><thead><tr>{"".join(f"<th>{h}</th>" for h in head)}</tr></thead><tbody>{body}</tbody></table></div>'
 
 

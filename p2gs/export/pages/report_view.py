@@ -1,7 +1,7 @@
 """The 3D view of RUN/report.html: the mesh and the Gaussians side by side, one camera and one slider a joint for both.
 
-The mesh is drawn by a small viewer of its own (report_viewer.js), the Gaussians by Spark (sparkjsdev.github.io, MIT licence; the bundle
-is made by spark/package.json). Both are in the page, so that it needs no network.
+The mesh is drawn by a small viewer of its own (report_viewer.js), the Gaussians by Spark (sparkjsdev.github.io, MIT
+licence; the bundle is made by spark/package.json). Both are in the page, so that it needs no network.
 """
 
 from __future__ import annotations

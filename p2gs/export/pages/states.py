@@ -13,9 +13,14 @@ from p2gs.gaussians.views import read_cameras
 
 
 def render_states(
-    run_dir: Path | str, times: Sequence[float], out: Optional[Path | str] = None, size: Optional[int] = None, video: bool = False
+    run_dir: Path | str,
+    times: Sequence[float],
+    out: Optional[Path | str] = None,
+    size: Optional[int] = None,
+    video: bool = False,
 ) -> list[Path]:
-    """Pictures of a finished run at any state times: t<time>.png and parts_t<time>.png in ``out`` (default RUN/media/states).
+    """Pictures of a finished run at any state times: t<time>.png and parts_t<time>.png in ``out`` (default
+    RUN/media/states).
 
     Times outside [0, 1] go on along each joint. size: longer side in pixels (default 512). video: also
     motion.mp4 from start to end and back on a turntable (motion.gif and frames/ where imageio-ffmpeg is not installed).

@@ -16,7 +16,8 @@ FPS = 24
 
 
 def turntable_frames(obj: ArticulatedObject, size: int = 512, seconds: float = 5.0) -> Iterator[np.ndarray]:
-    """Frames [size, 2 size, 3] uint8: colour beside part colours, once from t = 0 to 1 and back while the camera swings past the front.
+    """Frames [size, 2 size, 3] uint8: colour beside part colours, once from t = 0 to 1 and back while the camera swings
+    past the front.
 
     The camera starts from the side where most of the moving parts shows and sweeps 60 degrees to either side.
     """
@@ -31,7 +32,8 @@ def turntable_frames(obj: ArticulatedObject, size: int = 512, seconds: float = 5
 
 
 def write_video(folder: Path, frames: Sequence[np.ndarray], fps: int = FPS) -> list[Path]:
-    """Frames [H, W, 3] uint8 of even size as ``motion.mp4``; without imageio-ffmpeg as ``motion.gif`` and ``frames/0000.png`` ..."""
+    """Frames [H, W, 3] uint8 of even size as ``motion.mp4``; without imageio-ffmpeg as ``motion.gif`` and
+    ``frames/0000.png`` ..."""
     try:
         import imageio_ffmpeg
     except ImportError:
@@ -42,7 +44,9 @@ def write_video(folder: Path, frames: Sequence[np.ndarray], fps: int = FPS) -> l
         return [write_gif(folder / "motion.gif", frames, fps), stills]
     h, w = frames[0].shape[:2]
     path = folder / "motion.mp4"
-    writer = imageio_ffmpeg.write_frames(str(path), (w, h), fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2)
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (w, h), fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2
+    )
     writer.send(None)
     for frame in frames:
         writer.send(np.ascontiguousarray(frame))

@@ -1,4 +1,5 @@
-"""The twin in the browser (viser, optional): every part with a slider for its joint, colours as photographed or by part."""
+"""The twin in the browser (viser, optional): every part with a slider for its joint, colours as photographed or by
+part."""
 
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ FRUSTA = 24  # a state
 
 
 def splat_arrays(obj: ArticulatedObject, part: int) -> dict[str, np.ndarray]:
-    """What viser draws of the ``part``-th part at canonical time, float32: centers [n, 3], covariances [n, 3, 3], rgbs [n, 3] in 0..1
-    (without view dependence), opacities [n, 1]."""
+    """What viser draws of the ``part``-th part at canonical time, float32: centers [n, 3], covariances [n, 3, 3], rgbs
+    [n, 3] in 0..1 (without view dependence), opacities [n, 1]."""
     g = obj.gaussians[obj.part_ids == obj.parts[part].id]
     RS = quat_to_matrix(g.quats) * g.log_scales.exp()[:, None, :]
     arrays = {
@@ -107,7 +108,9 @@ class Stage:
 
     def _paint(self) -> None:
         for splat, rgbs, colour in self.splats.values():
-            splat.rgbs = np.broadcast_to(np.asarray(colour, np.float32), rgbs.shape).copy() if self.by_part.value else rgbs
+            splat.rgbs = (
+                np.broadcast_to(np.asarray(colour, np.float32), rgbs.shape).copy() if self.by_part.value else rgbs
+            )
 
     def _show_axes(self) -> None:
         for line in self.lines.values():
@@ -152,7 +155,8 @@ class Stage:
 
 
 def open_viewer(run_dir: Path | str, host: str = "127.0.0.1", port: int = 8080):
-    """Start the server for a run's twin and return it. Raises UserError where viser is not installed or the run has no twin."""
+    """Start the server for a run's twin and return it. Raises UserError where viser is not installed or the run has no
+    twin."""
     run_dir = Path(run_dir)
     obj = load_twin(run_dir)
     stage = Stage(f"p2gs {run_dir.name}", host, port)

@@ -1,8 +1,10 @@
-"""Room for every joint: collision pieces of different parts are trimmed until none touches another one over the whole range.
+"""Room for every joint: collision pieces of different parts are trimmed until none touches another one over the whole
+range.
 
-Reconstructed surfaces of parts that fit closely overlap by a voxel, and a convex piece stands out of the surface it covers. A simulator
-takes either for a contact that stops the joint. What a part passed through between the two photographed states was free, so a piece that
-reaches into that space is cut back by planes, which leaves it convex. A sweep is covered by the hulls of a piece at two near joint values.
+Reconstructed surfaces of parts that fit closely overlap by a voxel, and a convex piece stands out of the surface it
+covers. A simulator takes either for a contact that stops the joint. What a part passed through between the two
+photographed states was free, so a piece that reaches into that space is cut back by planes, which leaves it convex. A
+sweep is covered by the hulls of a piece at two near joint values.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from p2gs.export.links import Hinge, Link, joint_motion
 from p2gs.export.physics.convex import Piece, cut, separation
 
 GAP = 0.003  # share of the object's diagonal that is left between parts: Bullet alone adds 1 mm around each hull
-SHALLOW = 0.02  # share of the diagonal up to which an overlap is an error of the surfaces, which both parts give way to by half
+# share of the diagonal up to which an overlap is an error of the surfaces, which both parts give way to by half
+SHALLOW = 0.02
 ROUNDS = 4  # passes in which pieces may fall apart; the last one cuts by single planes, so that it ends
 LEAST = 0.15  # share of a piece's thickness (and of its volume) below which what is left of it goes
 
@@ -33,8 +36,9 @@ class Body:
 
 @dataclass(frozen=True)
 class Cleared:
-    """links: with trimmed pieces.  lost: share of each link's collision volume that went, by name.  blocking: (moving link, other link)
-    pairs that run into each other in one of the other's recorded states, though not in both, as photographed: a door before a drawer."""
+    """links: with trimmed pieces.  lost: share of each link's collision volume that went, by name.  blocking: (moving
+    link, other link) pairs that run into each other in one of the other's recorded states, though not in both, as
+    photographed: a door before a drawer."""
 
     links: list[Link]
     lost: dict[str, float]
@@ -42,8 +46,9 @@ class Cleared:
 
 
 def clear_links(links: list[Link]) -> Cleared:
-    """The links with collision pieces that are free of those of every other link: of the base over each joint's whole range, of each other
-    in both recorded states and over the range while the other one is in a recorded state that leaves room (at least one does)."""
+    """The links with collision pieces that are free of those of every other link: of the base over each joint's whole
+    range, of each other in both recorded states and over the range while the other one is in a recorded state that
+    leaves room (at least one does)."""
     bodies = [body_of(link) for link in links]
     solid = [b for b in bodies if b.pieces]
     if len(solid) < 2:
@@ -59,7 +64,8 @@ def clear_links(links: list[Link]) -> Cleared:
             if b.hinge is None:
                 _free(a, b, steps, np.eye(4), gap, diagonal)
                 continue
-            for value in (0.0, b.hinge.motion):  # both recorded states first: they hold whatever stands in the way later
+            # both recorded states first: they hold whatever stands in the way later
+            for value in (0.0, b.hinge.motion):
                 own = 0.0 if value == 0.0 else a.hinge.motion
                 _free(a, b, np.array([own]), joint_motion(b.hinge, value), gap, diagonal)
     for a in (b for b in solid if b.hinge is not None):
@@ -73,7 +79,10 @@ def clear_links(links: list[Link]) -> Cleared:
             for i in range(2):
                 if not deep[i] or (all(deep) and i == int(np.argmin(depths))):
                     _free(a, b, steps, poses[i], gap, diagonal)
-    out = [replace(link, collision=[_moved(p, -link.origin) for p in b.pieces]) for link, b in zip(links, bodies, strict=True)]
+    out = [
+        replace(link, collision=[_moved(p, -link.origin) for p in b.pieces])
+        for link, b in zip(links, bodies, strict=True)
+    ]
     lost = {b.name: 1 - sum(p.volume for p in b.pieces) / max(b.before, 1e-300) for b in bodies}
     return Cleared(out, lost, blocking)
 
@@ -89,7 +98,8 @@ def _moved(piece: Piece, shift: np.ndarray) -> Piece:
 
 
 def sweep_values(body: Body, gap: float) -> np.ndarray:
-    """Joint values [n] over the range, so near that the arc between two leaves their hull by less than a quarter of ``gap``."""
+    """Joint values [n] over the range, so near that the arc between two leaves their hull by less than a quarter of
+    ``gap``."""
     h = body.hinge
     lower, upper = min(h.lower, 0.0, h.motion), max(h.upper, 0.0, h.motion)
     if h.type == "prismatic":
@@ -131,7 +141,8 @@ def _depth(a: Body, b: Body, values: np.ndarray, other: np.ndarray, gap: float) 
 
 
 def touches(a: Body, b: Body, values: np.ndarray, other: np.ndarray, margin: float) -> bool:
-    """Whether a piece of ``a``, moved through joint values [n], comes within ``margin`` of one of ``b`` at ``other`` [4, 4]."""
+    """Whether a piece of ``a``, moved through joint values [n], comes within ``margin`` of one of ``b`` at ``other``
+    [4, 4]."""
     for poses in _poses(a, values):
         for i, j in _close(a, b, poses, other, margin):
             if separation(_hull_of(a.pieces[i], poses), _hull_of(b.pieces[j], (other,)))[0] > -margin:
@@ -149,7 +160,8 @@ def _hull_of(piece: Piece, poses: tuple[np.ndarray, ...]) -> Piece:
 
 
 def without(piece: Piece, sweep: Piece, gap: float) -> list[Piece]:
-    """What of a piece lies outside the box of a sweep and ``gap`` beyond it, as convex pieces: the largest is cut off first."""
+    """What of a piece lies outside the box of a sweep and ``gap`` beyond it, as convex pieces: the largest is cut off
+    first."""
     import trimesh
 
     to_box, extents = trimesh.bounds.oriented_bounds(trimesh.Trimesh(sweep.vertices, sweep.faces, process=False))
@@ -173,7 +185,8 @@ def _moved_by(piece: Piece, T: np.ndarray) -> Piece:
 
 
 def _free(a: Body, b: Body, values: np.ndarray, other: np.ndarray, gap: float, diagonal: float) -> None:
-    """Trim pieces of both until those of ``a``, moved through ``values``, keep ``gap`` from those of ``b`` at ``other``."""
+    """Trim pieces of both until those of ``a``, moved through ``values``, keep ``gap`` from those of ``b`` at
+    ``other``."""
     for poses in _poses(a, values):
         for last in (False,) * ROUNDS + (True,):  # pieces that fell apart are looked at again
             if not _trim(a, b, poses, other, gap, np.inf if last else SHALLOW * diagonal):
@@ -181,8 +194,9 @@ def _free(a: Body, b: Body, values: np.ndarray, other: np.ndarray, gap: float, d
 
 
 def _trim(a: Body, b: Body, poses: tuple[np.ndarray, ...], other: np.ndarray, gap: float, shallow: float) -> bool:
-    """One pass over the pairs of pieces: both give way by half where they overlap by up to ``shallow``; beyond that the piece of ``b`` is
-    wrong, as the part passed there, and what of it lies in the sweep goes. True where a piece fell apart."""
+    """One pass over the pairs of pieces: both give way by half where they overlap by up to ``shallow``; beyond that the
+    piece of ``b`` is wrong, as the part passed there, and what of it lies in the sweep goes. True where a piece fell
+    apart."""
     gone_a: set[int] = set()
     new: list[Piece] = []
     kept: list[Optional[Piece]] = list(b.pieces)
@@ -214,7 +228,8 @@ def _trim(a: Body, b: Body, poses: tuple[np.ndarray, ...], other: np.ndarray, ga
 
 
 def _cut_world(piece: Piece, T: np.ndarray, normal: np.ndarray, offset: float) -> Optional[Piece]:
-    """What of a piece, given at the start, lies at ``normal . x <= offset`` when it is moved by T; None where that is next to nothing."""
+    """What of a piece, given at the start, lies at ``normal . x <= offset`` when it is moved by T; None where that is
+    next to nothing."""
     n, d = T[:3, :3].T @ normal, offset - float(normal @ T[:3, 3])
     along = piece.vertices @ n
     if along.max() <= d:

@@ -1,7 +1,8 @@
-"""Convex pieces of a surface, for collision: small cells of it, merged while the merged hull encloses little that is not theirs.
+"""Convex pieces of a surface, for collision: small cells of it, merged while the merged hull encloses little that is
+not theirs.
 
-Works on open shells, as scanned surfaces are: a cabinet's shell becomes its panels, a door stays one piece. (Bottom-up as in
-Mamou and Ghorbel 2009, doi:10.1109/ICIP.2009.5414068, with grid cells in place of triangles.)
+Works on open shells, as scanned surfaces are: a cabinet's shell becomes its panels, a door stays one piece. (Bottom-up
+as in Mamou and Ghorbel 2009, doi:10.1109/ICIP.2009.5414068, with grid cells in place of triangles.)
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from p2gs.ops.knn import search_tree
 from p2gs.ops.unique_rows import unique_rows
 
 POINTS = 12000  # of the surface that the pieces are made from
-CELLS = 16  # along the longest side; with 12 a twentieth of the hulls is 2.3 % of the diagonal from the surface, with 16 1.5 %
+# along the longest side; with 12 a twentieth of the hulls is 2.3 % of the diagonal from the surface, with 16 1.5 %
+CELLS = 16
 CORNERS = 128  # directions whose outermost points make a piece's hull
 
 
@@ -40,7 +42,8 @@ class Piece:
 
 
 def thickened(points: np.ndarray, min_thickness: float) -> np.ndarray:
-    """Few points [M, 3] whose convex hull is nearly that of the points [N, 3], but at least ``min_thickness`` thick everywhere."""
+    """Few points [M, 3] whose convex hull is nearly that of the points [N, 3], but at least ``min_thickness`` thick
+    everywhere."""
     center = points.mean(0)
     axes = np.linalg.svd(points - center, full_matrices=False)[2] if len(points) >= 3 else np.eye(3)
     local = (points - center) @ axes.T
@@ -63,16 +66,20 @@ def hull(points: np.ndarray, min_thickness: float) -> Piece:
 
 
 def outermost(points: np.ndarray) -> np.ndarray:
-    """Indices of the points that are the furthest out in some of ``CORNERS`` directions (a coarse hull), and of the box's corners."""
+    """Indices of the points that are the furthest out in some of ``CORNERS`` directions (a coarse hull), and of the
+    box's corners."""
     i = np.arange(CORNERS) + 0.5
     polar, turn = np.arccos(1 - 2 * i / CORNERS), np.pi * (1 + 5**0.5) * i
     directions = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], 1)
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.maximum(np.ptp(points, axis=0), 1e-9)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.maximum(
+        np.ptp(points, axis=0), 1e-9
+    )
     return np.unique(np.concatenate([(points @ d.T).argmax(0) for d in (directions, corners, np.eye(3), -np.eye(3))]))
 
 
 def spread(vertices: np.ndarray, count: int = POINTS) -> tuple[np.ndarray, float]:
-    """About ``count`` of the vertices, evenly over the surface, and their spacing: one vertex in each cell of a grid."""
+    """About ``count`` of the vertices, evenly over the surface, and their spacing: one vertex in each cell of a
+    grid."""
     lo, size = vertices.min(0), float(np.ptp(vertices, axis=0).max())
     cell = size / 400
     while True:
@@ -85,11 +92,13 @@ def spread(vertices: np.ndarray, count: int = POINTS) -> tuple[np.ndarray, float
         cell *= 1.25
 
 
-def decompose(vertices: np.ndarray, max_pieces: int = 60, waste: float = 2e-4, min_thickness: Optional[float] = None) -> list[Piece]:
+def decompose(
+    vertices: np.ndarray, max_pieces: int = 60, waste: float = 2e-4, min_thickness: Optional[float] = None
+) -> list[Piece]:
     """Convex pieces that together cover the surface's vertices [N, 3].
 
-    waste: pieces merge while that encloses no more than this fraction of the cube of the size; beyond that only to get down to
-    ``max_pieces``.  min_thickness: of a piece, default 1 % of the size.
+    waste: pieces merge while that encloses no more than this fraction of the cube of the size; beyond that only to get
+    down to ``max_pieces``.  min_thickness: of a piece, default 1 % of the size.
     """
     from scipy.spatial import ConvexHull
 
@@ -126,7 +135,8 @@ def decompose(vertices: np.ndarray, max_pieces: int = 60, waste: float = 2e-4, m
 
 
 def cells_of(points: np.ndarray, spacing: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The points by cubic cell: keys [C, 3] and the points of each. A point near a wall is in both cells, so that no gap is left."""
+    """The points by cubic cell: keys [C, 3] and the points of each. A point near a wall is in both cells, so that no
+    gap is left."""
     size = float(np.ptp(points, axis=0).max()) / CELLS * 1.0001
     lo = (points.min(0) + points.max(0)) / 2 - size * np.ceil(np.ptp(points, axis=0) / size) / 2
     shifts = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.6 * spacing
@@ -141,7 +151,8 @@ def cells_of(points: np.ndarray, spacing: float) -> tuple[np.ndarray, list[np.nd
 
 def separation(a: Piece, b: Piece) -> tuple[float, np.ndarray, float, float]:
     """How deep two pieces reach into each other (negative: the gap between them is at least that wide), the unit normal
-    [3] from a to b along which that is least, and along it the last of a, the first of b. (Separating axes: normals, then edge pairs.)"""
+    [3] from a to b along which that is least, and along it the last of a, the first of b. (Separating axes: normals,
+    then edge pairs.)"""
     best = _least(a, b, np.concatenate([a.planes()[0], -b.planes()[0]]))
     if best[0] <= 0:
         return best
@@ -163,7 +174,9 @@ def _least(a: Piece, b: Piece, axes: np.ndarray) -> tuple[float, np.ndarray, flo
 
 def _directions(piece: Piece) -> np.ndarray:
     """Unit directions [D, 3] of the edges, those that differ by less than a hundredth taken once."""
-    pairs = np.unique(np.sort(np.concatenate([piece.faces[:, [0, 1]], piece.faces[:, [1, 2]], piece.faces[:, [2, 0]]]), 1), axis=0)
+    pairs = np.unique(
+        np.sort(np.concatenate([piece.faces[:, [0, 1]], piece.faces[:, [1, 2]], piece.faces[:, [2, 0]]]), 1), axis=0
+    )
     d = piece.vertices[pairs[:, 1]] - piece.vertices[pairs[:, 0]]
     d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)
     d *= np.where(d[np.arange(len(d)), np.abs(d).argmax(1)] < 0, -1.0, 1.0)[:, None]
@@ -177,11 +190,18 @@ def cut(piece: Piece, normal: np.ndarray, offset: float) -> Optional[Piece]:
     above = piece.vertices @ normal - offset
     if above.max() <= 0:
         return piece
-    pairs = np.unique(np.sort(np.concatenate([piece.faces[:, [0, 1]], piece.faces[:, [1, 2]], piece.faces[:, [2, 0]]]), 1), axis=0)
+    pairs = np.unique(
+        np.sort(np.concatenate([piece.faces[:, [0, 1]], piece.faces[:, [1, 2]], piece.faces[:, [2, 0]]]), 1), axis=0
+    )
     p, q = pairs[(above[pairs[:, 0]] > 0) != (above[pairs[:, 1]] > 0)].T
     share = (above[p] / (above[p] - above[q]))[:, None]
-    points = np.concatenate([piece.vertices[above <= 0], piece.vertices[p] + share * (piece.vertices[q] - piece.vertices[p])])
-    if len(points) < 4 or np.linalg.svd(points - points.mean(0), compute_uv=False)[-1] < 1e-7 * np.ptp(piece.vertices, axis=0).max():
+    points = np.concatenate(
+        [piece.vertices[above <= 0], piece.vertices[p] + share * (piece.vertices[q] - piece.vertices[p])]
+    )
+    if (
+        len(points) < 4
+        or np.linalg.svd(points - points.mean(0), compute_uv=False)[-1] < 1e-7 * np.ptp(piece.vertices, axis=0).max()
+    ):
         return None
     mesh = trimesh.convex.convex_hull(points)
     return Piece(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))

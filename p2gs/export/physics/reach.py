@@ -1,4 +1,5 @@
-"""``--extend-range``: how far a joint goes on beyond the two photographed states, by moving its collision pieces until they touch."""
+"""``--extend-range``: how far a joint goes on beyond the two photographed states, by moving its collision pieces until
+they touch."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ HALVINGS = 6  # of the step in which parts touch
 def extend_links(links: list[Link]) -> list[Link]:
     """The links (cleared of one another, ``links[0]`` the base) with joint limits that go on until pieces touch.
 
-    Each end of a joint's range is followed among the other parts as they were in that photographed state; half of the gap that clearing
-    left stays. What was observed stays within the limits.
+    Each end of a joint's range is followed among the other parts as they were in that photographed state; half of the
+    gap that clearing left stays. What was observed stays within the limits.
     """
     bodies = [body_of(link) for link in links]
     points = np.concatenate([p.vertices for b in bodies for p in b.pieces])
@@ -31,15 +32,22 @@ def extend_links(links: list[Link]) -> list[Link]:
         ends = [a.hinge.lower, a.hinge.upper]
         onward = 1 if a.hinge.motion >= 0 else -1
         for state, direction in ((0.0, -onward), (1.0, onward)):
-            others = [(b, np.eye(4) if b.hinge is None else joint_motion(b.hinge, state * b.hinge.motion)) for b in bodies if b is not a]
+            others = [
+                (b, np.eye(4) if b.hinge is None else joint_motion(b.hinge, state * b.hinge.motion))
+                for b in bodies
+                if b is not a
+            ]
             reached = follow(a, others, bodies[0], state * a.hinge.motion, direction, margin)
             ends = [min(ends[0], reached), max(ends[1], reached)]
         out[i] = replace(links[i], joint=replace(a.hinge, lower=ends[0], upper=ends[1]))
     return out
 
 
-def follow(a: Body, others: list[tuple[Body, np.ndarray]], base: Body, start: float, direction: int, margin: float) -> float:
-    """The joint value up to which ``a`` goes from ``start`` in ``direction`` (1 or -1) without coming within ``margin`` of the others.
+def follow(
+    a: Body, others: list[tuple[Body, np.ndarray]], base: Body, start: float, direction: int, margin: float
+) -> float:
+    """The joint value up to which ``a`` goes from ``start`` in ``direction`` (1 or -1) without coming within ``margin``
+    of the others.
 
     others: with their poses [4, 4].
     """

@@ -1,4 +1,5 @@
-"""Part and joint discovery from two reconstructed states: free-space evidence, exhaustive rigid hypotheses, joint selection, labels."""
+"""Part and joint discovery from two reconstructed states: free-space evidence, exhaustive rigid hypotheses, joint
+selection, labels."""
 
 from p2gs.motion.discovery.config import DiscoveryConfig
 from p2gs.motion.discovery.pipeline import discover, in_two, instead_of, places_changed, relabel, surface_energy

@@ -1,8 +1,8 @@
 """Bodies that move about one axis by amounts of their own: which two amounts explain what one does not.
 
-Stacked doors and neighbouring drawers share an axis and differ in how far they went. One free motion imitates two of them: the hinge of
-two stacked doors tilts a little, and the upper turns farther than the lower. So pairs are sought about the part's own axis and about
-directions that the object has anyway.
+Stacked doors and neighbouring drawers share an axis and differ in how far they went. One free motion imitates two of
+them: the hinge of two stacked doors tilts a little, and the upper turns farther than the lower. So pairs are sought
+about the part's own axis and about directions that the object has anyway.
 """
 
 from __future__ import annotations
@@ -31,17 +31,23 @@ def arm_of(problem: Problem, labelling: Labelling, motion: Motions, k: int) -> f
 
 
 def amounts_of(problem: Problem, motion: Motions, arm: float) -> Motions:
-    """``motion`` [1] by every amount of its sign that the search considers, a third of a tolerance apart at ``arm`` from the axis: [D]."""
+    """``motion`` [1] by every amount of its sign that the search considers, a third of a tolerance apart at ``arm``
+    from the axis: [D]."""
     cfg, tp = problem.config, problem.scale.tp
     most = math.radians(cfg.max_angle) if bool(motion.turn) else cfg.max_slide * problem.scale.diag
     least = tp / arm
     n = min(max(int((most - least) / (STEP * tp / arm)), 2), STEPS)
     amount = torch.linspace(least, most, n) * torch.sign(motion.amount)
-    return Motions(motion.turn.expand(n), motion.axis.expand(n, 3), motion.centre.expand(n, 3), amount, motion.thick.expand(n))
+    return Motions(
+        motion.turn.expand(n), motion.axis.expand(n, 3), motion.centre.expand(n, 3), amount, motion.thick.expand(n)
+    )
 
 
-def best_pair(problem: Problem, graphs: list[Graph], labelling: Labelling, motions: Motions, k: int, axis: Motions) -> Motions:
-    """The two amounts [2] about the axis of ``axis`` [1] that leave least of the moved surface unexplained, beside all motions but ``k``.
+def best_pair(
+    problem: Problem, graphs: list[Graph], labelling: Labelling, motions: Motions, k: int, axis: Motions
+) -> Motions:
+    """The two amounts [2] about the axis of ``axis`` [1] that leave least of the moved surface unexplained, beside all
+    motions but ``k``.
 
     A surfel costs what it does under the better of the two or under what else there is, averaged over its neighbours.
     """
@@ -62,7 +68,8 @@ def best_pair(problem: Problem, graphs: list[Graph], labelling: Labelling, motio
 
 
 def averaged(values: Tensor, index: Tensor, graph: Graph, rounds: int = 8) -> Tensor:
-    """values [M, D] of surfels ``index`` [M], half of each its own and half its neighbours' of these, ``rounds`` times."""
+    """values [M, D] of surfels ``index`` [M], half of each its own and half its neighbours' of these, ``rounds``
+    times."""
     full, have = torch.zeros(len(graph.neighbours), values.shape[1]), torch.zeros(len(graph.neighbours), 1)
     full[index], have[index] = values, 1.0
     mass = graph.average(have).clamp_min(1e-3)
@@ -72,11 +79,18 @@ def averaged(values: Tensor, index: Tensor, graph: Graph, rounds: int = 8) -> Te
     return full[index]
 
 
-def parted(problem: Problem, graphs: list[Graph], labelling: Labelling, motions: Motions, k: int, axes: Tensor) -> list[Motions]:
-    """The motions with the best pair of amounts instead of part k's one, the second last: about its own axis, and about it turned onto
-    directions ``axes`` [D, 3] that the object has."""
+def parted(
+    problem: Problem, graphs: list[Graph], labelling: Labelling, motions: Motions, k: int, axes: Tensor
+) -> list[Motions]:
+    """The motions with the best pair of amounts instead of part k's one, the second last: about its own axis, and about
+    it turned onto directions ``axes`` [D, 3] that the object has."""
     own = motions[k : k + 1]
-    mine = torch.cat([problem.surfels[0].points[labelling.labels(0) == k + 1], own.apply(problem.surfels[1].points[labelling.labels(1) == k + 1], True)[0]])
+    mine = torch.cat(
+        [
+            problem.surfels[0].points[labelling.labels(0) == k + 1],
+            own.apply(problem.surfels[1].points[labelling.labels(1) == k + 1], True)[0],
+        ]
+    )
     if not len(mine):
         return []
     on = snapped(problem, own, mine.mean(0), axes)

@@ -16,7 +16,8 @@ from p2gs.visibility.surfels import Surfels
 
 
 def normal_code(n: Tensor) -> Tensor:
-    """Facing [..., 3] -> one of 27 sign patterns (a component counts when above 0.38); 13 is the impossible zero pattern."""
+    """Facing [..., 3] -> one of 27 sign patterns (a component counts when above 0.38); 13 is the impossible zero
+    pattern."""
     s = (n > 0.38).to(torch.int32) - (n < -0.38).to(torch.int32) + 1
     return (s[..., 0] * 3 + s[..., 1]) * 3 + s[..., 2]
 
@@ -29,12 +30,15 @@ def code_directions() -> Tensor:
 
 def surfel_rows(surfels: Surfels, static: Tensor) -> Tensor:
     """[N, 12] as the kernels read surfels: point, normal, colour, static [N] as 0 or 1, two zeros."""
-    return torch.cat([surfels.points, surfels.normals, surfels.colours, static[:, None], torch.zeros(len(surfels), 2)], 1).float()
+    return torch.cat(
+        [surfels.points, surfels.normals, surfels.colours, static[:, None], torch.zeros(len(surfels), 2)], 1
+    ).float()
 
 
 @dataclass
 class Scale:
-    """Lengths that every threshold is made of. tau: depth tolerance; tp: tolerance across a surface; spacing; diag: box diagonal."""
+    """Lengths that every threshold is made of. tau: depth tolerance; tp: tolerance across a surface; spacing; diag: box
+    diagonal."""
 
     tau: float
     tp: float
@@ -45,16 +49,26 @@ class Scale:
 class Landing:
     """Cost in 0..1 of a surfel arriving somewhere in one state.
 
-    Arriving on a like surface costs nothing, inside space the state's cameras never saw 0.35, deep in space they saw to be
-    empty 1, on a surface that never moved 0.2 more.  A plate of known thickness may show its other side: arriving that far behind a
-    surface that faces the other way costs 0.1, half of what colours that disagree cost, as the sides' colours tell nothing.
+    Arriving on a like surface costs nothing, inside space the state's cameras never saw 0.35, deep in space they saw to
+    be empty 1, on a surface that never moved 0.2 more.  A plate of known thickness may show its other side: arriving
+    that far behind a surface that faces the other way costs 0.1, half of what colours that disagree cost, as the sides'
+    colours tell nothing.
     """
 
     HIDDEN = 0.35
     ON_STATIC = 0.20
     TWO_SIDED = 0.10
 
-    def __init__(self, surfels: Surfels, static: Tensor, stack: DepthStack, lo: Tensor, hi: Tensor, scale: Scale, cells: float = 3e5):
+    def __init__(
+        self,
+        surfels: Surfels,
+        static: Tensor,
+        stack: DepthStack,
+        lo: Tensor,
+        hi: Tensor,
+        scale: Scale,
+        cells: float = 3e5,
+    ):
         self.surfels, self.static, self.scale = surfels, static, scale
         self.h = float(((hi - lo).prod() / cells) ** (1 / 3))
         self.lo = lo
@@ -110,7 +124,8 @@ class Landing:
     def cost(
         self, x: Tensor, n: Tensor, c: Tensor | None = None, claimed: Tensor | None = None, thick: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Cost [...] and matched surfel [...]. claimed [M] in 0..1: surfels that another part explains already cost like static ones.
+        """Cost [...] and matched surfel [...]. claimed [M] in 0..1: surfels that another part explains already cost
+        like static ones.
         thick [...]: of the plate that arrives; where above 0 its other side may be what is met."""
         cost, j = self.matching(x, n, c, claimed)
         free = self.free(x)
@@ -122,7 +137,8 @@ class Landing:
         return torch.minimum(cost, self.HIDDEN + (1 - self.HIDDEN) * free).clamp_max(1), j
 
     def matching(self, x: Tensor, n: Tensor, c: Tensor | None, claimed: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Cost [...] of taking the surfel met for one's own place, and that surfel [...]; c: None where colours are another side's."""
+        """Cost [...] of taking the surfel met for one's own place, and that surfel [...]; c: None where colours are
+        another side's."""
         s, k = self.surfels, self.scale
         j = self.match(x, n)
         d = x - s.points[j]
@@ -140,8 +156,9 @@ class Landing:
     def arrive(
         self, motions: Motions, source: "Landing", index: Tensor, back: bool = False, claimed: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Cost [B, P] and matched surfel [B, P] of the surfels ``index`` [P] of the other state, ``source``, carried here by motions or,
-        ``back``, by their inverses.  One pass of a kernel where there is one, else ``cost``, which it equals up to rounding."""
+        """Cost [B, P] and matched surfel [B, P] of the surfels ``index`` [P] of the other state, ``source``, carried
+        here by motions or, ``back``, by their inverses.  One pass of a kernel where there is one, else ``cost``, which
+        it equals up to rounding."""
         if not self.fused:
             s = source.surfels
             x, n = motions.apply(s.points[index], back), motions.rotate(s.normals[index], back)

@@ -37,13 +37,20 @@ def part_samples(problem: Problem, labelling: Labelling, k: int, n: int, moved_o
 
 
 def snapped(problem: Problem, motion: Motions, middle: Tensor, axes: Tensor, within: float = 15.0) -> Motions:
-    """``motion`` [1] with its axis turned (about the part's middle) onto each scene direction within ``within`` degrees: [0..]."""
+    """``motion`` [1] with its axis turned (about the part's middle) onto each scene direction within ``within``
+    degrees: [0..]."""
     c = axes @ motion.axis[0]
     near = c.abs() > math.cos(math.radians(within))
     n = int(near.sum())
     a = motion.axis[0]
     centre = motion.centre[0] + a * ((middle - motion.centre[0]) @ a)
-    return Motions(motion.turn.expand(n), axes[near] * c[near].sign()[:, None], centre.expand(n, 3), motion.amount.expand(n), motion.thick.expand(n))
+    return Motions(
+        motion.turn.expand(n),
+        axes[near] * c[near].sign()[:, None],
+        centre.expand(n, 3),
+        motion.amount.expand(n),
+        motion.thick.expand(n),
+    )
 
 
 def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, axes: Tensor, n: int = 900) -> Motions:
@@ -56,7 +63,8 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
     if max(len(s) for s in samples) < 8:
         return m
     weights = []
-    for s, index in enumerate(samples):  # who is not known to have moved may be a neighbour's, and only seconds the others
+    # who is not known to have moved may be a neighbour's, and only seconds the others
+    for s, index in enumerate(samples):
         w = torch.where(problem.moved[s], 0.3 + problem.trust[s], torch.where(problem.static[s], 0.03, 0.2))[index]
         weights.append(w / w.sum().clamp_min(1e-9))
     tp = problem.scale.tp
@@ -85,10 +93,16 @@ def fit_part(problem: Problem, labelling: Labelling, motions: Motions, k: int, a
     return free
 
 
-def settle_parts(problem: Problem, graphs: list[Graph], motions: Motions, axes: Tensor, rounds: int = 2) -> tuple[Motions, Labelling]:
+def settle_parts(
+    problem: Problem, graphs: list[Graph], motions: Motions, axes: Tensor, rounds: int = 2
+) -> tuple[Motions, Labelling]:
     """Labels and fits in turn. axes [D, 3]: directions of the static surfaces."""
     labelling = label(problem, motions, graphs)
     for _ in range(rounds):
-        motions = Motions.cat([fit_part(problem, labelling, motions, k, axes) for k in range(len(motions))]) if len(motions) else motions
+        motions = (
+            Motions.cat([fit_part(problem, labelling, motions, k, axes) for k in range(len(motions))])
+            if len(motions)
+            else motions
+        )
         labelling = label(problem, motions, graphs)
     return motions, labelling

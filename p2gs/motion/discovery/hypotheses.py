@@ -1,4 +1,5 @@
-"""Rigid-motion hypotheses by exhaustive search: every slide and turn about the object's own directions, on a coarse grid."""
+"""Rigid-motion hypotheses by exhaustive search: every slide and turn about the object's own directions, on a coarse
+grid."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ def half_sphere(n: int = 400) -> Tensor:
 
 
 def normal_peaks(normals: Tensor, n: int, apart: float = 25.0, least: float = 0.03) -> tuple[Tensor, Tensor]:
-    """Up to n directions (sign-free) that many normals share, refined by mean shift, and the share of normals within 12 deg."""
+    """Up to n directions (sign-free) that many normals share, refined by mean shift, and the share of normals within 12
+    deg."""
     grid = half_sphere()
     score = ((normals @ grid.T).abs() > math.cos(math.radians(12))).float().mean(0)
     found, share = [], []
@@ -47,7 +49,8 @@ def normal_peaks(normals: Tensor, n: int, apart: float = 25.0, least: float = 0.
 
 
 def directions(problem: Problem, limit: int = 8, apart: float = 12.0) -> Tensor:
-    """[D, 3] candidate axes: what the surfaces face, what the moved surfaces face, and where moved facings of the two states cross."""
+    """[D, 3] candidate axes: what the surfaces face, what the moved surfaces face, and where moved facings of the two
+    states cross."""
     everything = torch.cat([s.normals for s in problem.surfels])
     moved = [problem.surfels[s].normals[problem.moved[s]] for s in (0, 1)]
     chosen: list[Tensor] = []
@@ -63,7 +66,9 @@ def directions(problem: Problem, limit: int = 8, apart: float = 12.0) -> Tensor:
     add(normal_peaks(everything, 3, apart=40.0)[0])
     add(torch.cat([flat_axis(n) for n in (torch.cat(moved), everything)]))
     peaks = [normal_peaks(m, 4)[0] for m in moved]
-    crosses = [torch.linalg.cross(a, b) for a in peaks[0] for b in peaks[1] if float(torch.linalg.cross(a, b).norm()) > 0.2]
+    crosses = [
+        torch.linalg.cross(a, b) for a in peaks[0] for b in peaks[1] if float(torch.linalg.cross(a, b).norm()) > 0.2
+    ]
     if crosses:
         crosses = torch.nn.functional.normalize(torch.stack(crosses), dim=1)
         both = torch.cat(moved)
@@ -91,7 +96,8 @@ def static_axes(problem: Problem) -> Tensor:
 
 
 def arrival_table(landing: Landing, moved: Tensor) -> Tensor:
-    """[27 * voxels] uint8: how well a facing pattern at a coarse voxel finds a like surfel there, 0..255; never-moved ones count less."""
+    """[27 * voxels] uint8: how well a facing pattern at a coarse voxel finds a like surfel there, 0..255; never-moved
+    ones count less."""
     centre = landing._centres(landing.coarse, landing.hc)
     near = landing.nearest.reshape(27, -1).long()
     d = (landing.surfels.points[near] - centre).norm(dim=2)
@@ -108,7 +114,8 @@ class Sweep:
     samples: list[Tensor]
 
     def gain(self, weights: list[Tensor], chunk: int = 20000) -> Tensor:
-        """Evidence of each motion, points weighted [P0], [P1] (each state's weights sum to at most 1); states must agree."""
+        """Evidence of each motion, points weighted [P0], [P1] (each state's weights sum to at most 1); states must
+        agree."""
         n = len(weights[0])
         w = torch.zeros(n + len(weights[1]), 2)
         w[:n, 0], w[n:, 1] = weights[0] / 255, weights[1] / 255
@@ -153,7 +160,9 @@ def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120
     amounts = torch.cat([amounts, -amounts, torch.tensor([0.4 * hc, -0.4 * hc])])
     for d in axes:
         shift = amounts[:, None] * d / hc
-        q = torch.cat([look(points[0], normals[0], shift, tables[1]), look(points[1], normals[1], -shift, tables[0])], 1)
+        q = torch.cat(
+            [look(points[0], normals[0], shift, tables[1]), look(points[1], normals[1], -shift, tables[0])], 1
+        )
         C = len(amounts)
         keep_good(Motions(torch.zeros(C, dtype=torch.bool), d.expand(C, 3), problem.centre.expand(C, 3), amounts), q)
     span = hc * (size - 1)
@@ -173,7 +182,8 @@ def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120
                 R = m[:1].matrices()[0][0]
                 shifts = [(centre - lo) / hc @ (torch.eye(3) - turn).T for turn in (R, R.T)]
                 q = []
-                for s, turn in enumerate((R, R.T)):  # a plate may arrive with either side to the cameras: what turns shows other sides
+                # a plate may arrive with either side to the cameras: what turns shows other sides
+                for s, turn in enumerate((R, R.T)):
                     p, facing = points[s] @ turn.T, normals[s] @ turn.T
                     same = look(p, facing, shifts[s], tables[1 - s])
                     other = look(p - PLATE * facing, -facing, shifts[s], tables[1 - s])
@@ -189,7 +199,8 @@ def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120
 
 
 def distinct(motions: Motions, score: Tensor, probe: Tensor, radius: float, count: int) -> Tensor:
-    """Indices of the best ``count`` motions that move the probe points [P, 3] apart by more than ``radius`` (rms) from better ones."""
+    """Indices of the best ``count`` motions that move the probe points [P, 3] apart by more than ``radius`` (rms) from
+    better ones."""
     order = score.argsort(descending=True)[: 40 * count]
     m = motions[order]
     image = m.apply(probe).reshape(len(m), -1) / math.sqrt(len(probe))

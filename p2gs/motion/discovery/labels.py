@@ -1,4 +1,5 @@
-"""Which surfel belongs to which motion: landing costs of every point under every label, made to agree among neighbours."""
+"""Which surfel belongs to which motion: landing costs of every point under every label, made to agree among
+neighbours."""
 
 from __future__ import annotations
 
@@ -14,11 +15,13 @@ from p2gs.motion.discovery.problem import Problem
 from p2gs.motion.discovery.rigid import Motions
 from p2gs.native import native, num_threads
 
-REVEALED = 0.3  # cost of staying, of what has another colour than was there before: less than hiding (0.35), as it may have been behind
+# cost of staying, of what has another colour than was there before: less than hiding (0.35), as it may have been behind
+REVEALED = 0.3
 
 
 class Graph:
-    """k nearest neighbours as a sparse matrix [N, N], rows summing to 1; weights fall across creases, steps in colour and distance."""
+    """k nearest neighbours as a sparse matrix [N, N], rows summing to 1; weights fall across creases, steps in colour
+    and distance."""
 
     def __init__(self, points: Tensor, normals: Tensor, colours: Tensor, k: int = 10):
         n, k = len(points), min(k, len(points) - 1)
@@ -26,9 +29,17 @@ class Graph:
         d, j = torch.from_numpy(d[:, 1:].astype(np.float32)), torch.from_numpy(j[:, 1:])
         facing = (normals[j] * normals[:, None]).sum(2).clamp(-1, 1)
         colour = (colours[j] - colours[:, None]).abs().mean(2)
-        w = torch.exp(-((d / (1.5 * d[:, -1:].median())) ** 2)) * torch.exp(-1.5 * (1 - facing)) * torch.exp(-4 * colour) + 1e-4
-        self.weights, self.neighbours = (w / w.sum(1, keepdim=True)).contiguous(), j.to(torch.int32).contiguous()  # [N, k] each
-        self.matrix = csr_matrix((self.weights.numpy().reshape(-1), j.numpy().reshape(-1), np.arange(0, n * k + 1, k)), (n, n))
+        w = (
+            torch.exp(-((d / (1.5 * d[:, -1:].median())) ** 2))
+            * torch.exp(-1.5 * (1 - facing))
+            * torch.exp(-4 * colour)
+            + 1e-4
+        )
+        # [N, k] each
+        self.weights, self.neighbours = ((w / w.sum(1, keepdim=True)).contiguous(), j.to(torch.int32).contiguous())
+        self.matrix = csr_matrix(
+            (self.weights.numpy().reshape(-1), j.numpy().reshape(-1), np.arange(0, n * k + 1, k)), (n, n)
+        )
 
     def average(self, values: Tensor) -> Tensor:
         """values [N, K] -> weighted mean over neighbours [N, K]."""
@@ -49,15 +60,19 @@ def softmax(x: Tensor) -> Tensor:
 
 
 def arrivals(problem: Problem, motions: Motions, state: int) -> tuple[Tensor, Tensor]:
-    """Landing cost [K, N] of every surfel of ``state`` under each motion, and the surfel [K, N] of the other state that it meets."""
+    """Landing cost [K, N] of every surfel of ``state`` under each motion, and the surfel [K, N] of the other state that
+    it meets."""
     return problem.cost(motions, state, torch.arange(len(problem.surfels[state])))
 
 
-def unary(problem: Problem, motions: Motions, state: int, revealed: bool = False, landed: tuple[Tensor, Tensor] | None = None) -> Tensor:
+def unary(
+    problem: Problem, motions: Motions, state: int, revealed: bool = False, landed: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
     """Cost [N, K + 1] of every surfel of ``state`` under static (column 0) and each motion.
 
-    A surfel that a motion lays on a surface known to have moved is wanted there: that surface must come from somewhere.  revealed: what has
-    another colour than was there before may have stayed, behind it (for known motions; while they are searched it must be accounted for).
+    A surfel that a motion lays on a surface known to have moved is wanted there: that surface must come from somewhere.
+    revealed: what has another colour than was there before may have stayed, behind it (for known motions; while they
+    are searched it must be accounted for).
     landed: ``arrivals`` where they are known already.
     """
     n = len(problem.surfels[state])
@@ -76,7 +91,9 @@ def unary(problem: Problem, motions: Motions, state: int, revealed: bool = False
     return torch.stack(columns, 1)
 
 
-def smooth_labels(cost: Tensor, graph: Graph, diffuse: int = 8, rounds: int = 15, pull: float = 2.5, sharp: float = 12.0) -> Tensor:
+def smooth_labels(
+    cost: Tensor, graph: Graph, diffuse: int = 8, rounds: int = 15, pull: float = 2.5, sharp: float = 12.0
+) -> Tensor:
     """Probabilities [N, K + 1]: costs diffused along the surface, then a mean-field Potts model.
 
     pull: weight of the neighbours' labels.  sharp: probabilities are softmax of -sharp * cost.
@@ -121,7 +138,8 @@ class Labelling:
 
 
 def label(problem: Problem, motions: Motions, graphs: list[Graph], agree: int = 2, revealed: bool = False) -> Labelling:
-    """Label both states; after a first pass, points pay for landing on a surface that the other state labels differently."""
+    """Label both states; after a first pass, points pay for landing on a surface that the other state labels
+    differently."""
     landed = [arrivals(problem, motions, s) for s in (0, 1)]
     costs = [unary(problem, motions, s, revealed, landed[s]) for s in (0, 1)]
     p = [smooth_labels(costs[s], graphs[s]) for s in (0, 1)]

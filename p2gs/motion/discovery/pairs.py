@@ -1,6 +1,7 @@
 """Two parts that look alike may have been taken for one another: each one's start for the other's end.
 
-Every surfel is explained then, and no exchange of one motion mends it: the other part would be where nothing is seen. Both must change at once.
+Every surfel is explained then, and no exchange of one motion mends it: the other part would be where nothing is seen.
+Both must change at once.
 """
 
 from __future__ import annotations
@@ -33,21 +34,28 @@ def part_evidence(search: Search, labelling: Labelling, parts: int) -> list[Tens
 
 
 def carried(search: Search, labelling: Labelling, gains: Tensor, a: int, b: int) -> Motions:
-    """The best turn and the best slide that take part a's start for part b's end; gains [H] of the sweep's motions at that."""
+    """The best turn and the best slide that take part a's start for part b's end; gains [H] of the sweep's motions at
+    that."""
     top = distinct(search.swept.motions, gains, search.probe, search.radius, STARTS)
-    samples = [part_samples(search.problem, labelling, k, search.problem.config.samples)[s] for s, k in enumerate((a, b))]
+    samples = [
+        part_samples(search.problem, labelling, k, search.problem.config.samples)[s] for s, k in enumerate((a, b))
+    ]
     if not len(top) or min(map(len, samples)) < 3:
         return Motions.empty()
     weights = [search.problem.trust[s][i] / search.problem.trust[s][i].sum() for s, i in enumerate(samples)]
     gain = ExclusiveGain(search.problem, samples, weights)
     motions, value = search.sharpened(search.swept.motions[top], gain, 6, each=True)
-    best = [torch.where(kind, value, -torch.ones_like(value)).argmax() for kind in (motions.turn, ~motions.turn) if bool(kind.any())]
+    best = [
+        torch.where(kind, value, -torch.ones_like(value)).argmax()
+        for kind in (motions.turn, ~motions.turn)
+        if bool(kind.any())
+    ]
     return motions[torch.stack(best)] if best else motions
 
 
 def crossed(search: Search, labelling: Labelling, motions: Motions, count: int) -> list[tuple[int, Motions]]:
-    """For the ``count`` pairs of which the sweep explains most that way: all motions, with such as take each of the two parts' start for the
-    other's end. (first of the two, motions)."""
+    """For the ``count`` pairs of which the sweep explains most that way: all motions, with such as take each of the two
+    parts' start for the other's end. (first of the two, motions)."""
     start, end = part_evidence(search, labelling, len(motions))
 
     def gains(a: int, b: int) -> Tensor:
@@ -60,7 +68,9 @@ def crossed(search: Search, labelling: Labelling, motions: Motions, count: int) 
     out = []
     pairs = sorted(itertools.combinations(range(len(motions)), 2), key=most, reverse=True)
     for a, b in pairs[:count]:
-        for one, two in itertools.product(*(_each(carried(search, labelling, gains(*p), *p)) for p in ((a, b), (b, a)))):
+        for one, two in itertools.product(
+            *(_each(carried(search, labelling, gains(*p), *p)) for p in ((a, b), (b, a)))
+        ):
             more = [one if k == a else two if k == b else motions[k : k + 1] for k in range(len(motions))]
             out.append((a, Motions.cat(more)))
     return out

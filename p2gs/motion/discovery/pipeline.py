@@ -38,12 +38,14 @@ def discover(
 ) -> Discovery:
     """Find the moving parts, their motions and who belongs to them. No ground truth, no learning.
 
-    num_parts: upper bound that counts the static base, or "auto" (``max_parts``).  progress: called with a stage's name and the share done.
-    Raises UserError for a bad ``num_parts``.  Deterministic for a seed.
+    num_parts: upper bound that counts the static base, or "auto" (``max_parts``).  progress: called with a stage's name
+    and the share done. Raises UserError for a bad ``num_parts``.  Deterministic for a seed.
     """
     config = config or DiscoveryConfig()
     if num_parts != "auto" and (not isinstance(num_parts, int) or num_parts < 1):
-        raise UserError(f"num_parts is {num_parts!r}, expected 'auto' or a whole number of parts that counts the static base")
+        raise UserError(
+            f"num_parts is {num_parts!r}, expected 'auto' or a whole number of parts that counts the static base"
+        )
     limit = (config.max_parts if num_parts == "auto" else num_parts) - 1
     tell = progress or (lambda stage, share: None)
     clock, seconds = time.perf_counter(), {}
@@ -67,7 +69,9 @@ def discover(
         figures |= {"axes": axes.tolist(), "search": []}
         for number in range(searches):
             looked = problem if number == 0 else resampled(problem, seed + number)
-            swept = sweep(looked, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in looked.samples])
+            swept = sweep(
+                looked, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in looked.samples]
+            )
             one = Search(looked, swept, most, config.part_cost)
             search = search or one
             solutions = one.solve()
@@ -108,16 +112,19 @@ def discover(
 
 
 def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate:
-    """The explanation by other motions: transforms [K, 4, 4] start -> end, types "revolute" | "prismatic". Every surfel chooses anew."""
+    """The explanation by other motions: transforms [K, 4, 4] start -> end, types "revolute" | "prismatic". Every surfel
+    chooses anew."""
     motions = sided(found.problem, as_motions(transforms, types))
     labelling = label(found.problem, motions, found.graphs, revealed=True)
-    return Candidate(found_motions(found.problem, motions, labelling), found.problem.surfels, labelling.probability, 0.0)
+    return Candidate(
+        found_motions(found.problem, motions, labelling), found.problem.surfels, labelling.probability, 0.0
+    )
 
 
 def surface_energy(found: Discovery, transforms: Tensor, types: list[str]) -> float:
-    """What the surfaces say against motions [K, 4, 4], every surfel choosing anew: where they land in seen-free space or on what has another
-    colour, moved surface that nothing carries, implausible joints, a price on each part, less what the motions explain. Lower is better; 0
-    where nothing moved."""
+    """What the surfaces say against motions [K, 4, 4], every surfel choosing anew: where they land in seen-free space
+    or on what has another colour, moved surface that nothing carries, implausible joints, a price on each part, less
+    what the motions explain. Lower is better; 0 where nothing moved."""
     if found.search is None:
         return 0.0
     motions = sided(found.problem, as_motions(transforms, types))
@@ -125,11 +132,14 @@ def surface_energy(found: Discovery, transforms: Tensor, types: list[str]) -> fl
     return total_score(found.problem, motions, labelling)
 
 
-def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int | None, count: int = 2) -> list[tuple[Tensor, str]]:
-    """Motions [4, 4] that best explain what all parts but ``part`` leave over (None: what all leave over), and their types: up to
-    ``count`` turns and as many slides, without the part's own.
+def instead_of(
+    found: Discovery, transforms: Tensor, types: list[str], part: int | None, count: int = 2
+) -> list[tuple[Tensor, str]]:
+    """Motions [4, 4] that best explain what all parts but ``part`` leave over (None: what all leave over), and their
+    types: up to ``count`` turns and as many slides, without the part's own.
 
-    The search fits all parts to one another's remains while all are rough; with the others refined the same evidence can say more.
+    The search fits all parts to one another's remains while all are rough; with the others refined the same evidence
+    can say more.
     """
     search = found.search
     if search is None:
@@ -143,13 +153,15 @@ def instead_of(found: Discovery, transforms: Tensor, types: list[str], part: int
     best = sorted(range(len(index)), key=lambda i: search.value([*rest, index[i]]), reverse=True)
     known = own if part is None else own[part : part + 1]
     far = (known.swept(search.probe, motions) > search.radius).all(0)
-    picked = [i for turn in (True, False) for i in [i for i in best if far[i] and bool(motions.turn[i]) == turn][:count]]
+    picked = [
+        i for turn in (True, False) for i in [i for i in best if far[i] and bool(motions.turn[i]) == turn][:count]
+    ]
     return [(motions.transform(i), "revolute" if bool(motions.turn[i]) else "prismatic") for i in picked]
 
 
 def in_two(found: Discovery, transforms: Tensor, types: list[str]) -> list[tuple[int, Tensor, list[str]]]:
-    """Each part as two bodies that move about one axis by amounts of their own, by the pairs that leave least of the moved surface
-    unexplained: (part, motions [K + 1, 4, 4] with the second body's last, their types)."""
+    """Each part as two bodies that move about one axis by amounts of their own, by the pairs that leave least of the
+    moved surface unexplained: (part, motions [K + 1, 4, 4] with the second body's last, their types)."""
     if found.search is None:
         return []
     problem = found.problem
@@ -161,8 +173,11 @@ def in_two(found: Discovery, transforms: Tensor, types: list[str]) -> list[tuple
     return out
 
 
-def places_changed(found: Discovery, transforms: Tensor, types: list[str], count: int = 3) -> list[tuple[int, Tensor, list[str]]]:
-    """Two parts each with the other's end for its own, for the ``count`` pairs that explain most so: (one of them, motions [K, 4, 4], types)."""
+def places_changed(
+    found: Discovery, transforms: Tensor, types: list[str], count: int = 3
+) -> list[tuple[int, Tensor, list[str]]]:
+    """Two parts each with the other's end for its own, for the ``count`` pairs that explain most so: (one of them,
+    motions [K, 4, 4], types)."""
     if found.search is None or len(types) < 2:
         return []
     own = sided(found.problem, as_motions(transforms, types))
@@ -201,7 +216,8 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, limit: int, 
 
 
 def divided(problem: Problem, graphs: list[Graph], found: Explanation, limit: int, axes: Tensor) -> Explanation:
-    """Parts made two by amounts of their own about one axis (``parted``), up to ``limit`` parts, while the score falls."""
+    """Parts made two by amounts of their own about one axis (``parted``), up to ``limit`` parts, while the score
+    falls."""
     while 0 < len(found.motions) < limit:
         best = found
         for k in range(len(found.motions)):
@@ -218,7 +234,9 @@ def divided(problem: Problem, graphs: list[Graph], found: Explanation, limit: in
     return found
 
 
-def again(problem: Problem, graphs: list[Graph], search: Search, found: list[Explanation], limit: int, axes: Tensor) -> list[Explanation]:
+def again(
+    problem: Problem, graphs: list[Graph], search: Search, found: list[Explanation], limit: int, axes: Tensor
+) -> list[Explanation]:
     """What the search makes of the best explanations once their motions are fitted: sets that are new to it, finished.
 
     A wrong motion is often there because a rough one left over what it explains.
@@ -246,7 +264,8 @@ def ranked(search: Search, found: list[Explanation]) -> list[Explanation]:
 def prune(
     problem: Problem, graphs: list[Graph], motions: Motions, labelling: Labelling, limit: int, axes: Tensor
 ) -> Explanation:
-    """Drop parts, the least needed first, down to ``limit`` and while the explanation of both states' images gets no worse without them."""
+    """Drop parts, the least needed first, down to ``limit`` and while the explanation of both states' images gets no
+    worse without them."""
     score = total_score(problem, motions, labelling)
     while len(motions) > 1:
         tried = []
@@ -262,17 +281,24 @@ def prune(
 
 
 def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> float:
-    """Image-space violation, the price of every part and half of the moved surface that hangs on implausible joints. Lower is better."""
+    """Image-space violation, the price of every part and half of the moved surface that hangs on implausible joints.
+    Lower is better."""
     if not len(motions):
         return image_score(problem, motions, labelling)
     pays = [p for p, _ in problem.pay(motions)]
-    doubt = float((torch.tensor(masses(problem, labelling)) * (1 - plausibility(problem, motions, pays, problem.samples, False))).sum())
+    doubt = float(
+        (
+            torch.tensor(masses(problem, labelling))
+            * (1 - plausibility(problem, motions, pays, problem.samples, False))
+        ).sum()
+    )
     return image_score(problem, motions, labelling) + problem.config.part_cost * len(motions) + 0.5 * doubt
 
 
 def twins(problem: Problem, motions: Motions, labelling: Labelling) -> int | None:
-    """The smaller part of two that touch and whose motions carry their points to the same places, to within the tolerance across surfaces:
-    surfaces cannot tell them apart (the photographs are asked later). None where there are no such two."""
+    """The smaller part of two that touch and whose motions carry their points to the same places, to within the
+    tolerance across surfaces: surfaces cannot tell them apart (the photographs are asked later). None where there are
+    no such two."""
     mass = masses(problem, labelling)
     for small in sorted(range(len(motions)), key=mass.__getitem__):
         for large in (k for k in range(len(motions)) if k != small):
@@ -317,7 +343,10 @@ def found_motions(problem: Problem, motions: Motions, labelling: Labelling) -> l
         turn = bool(motions.turn[k])
         mine = [labelling.labels(s) == k + 1 for s in (0, 1)]
         rows = [of.nonzero()[:, 0] for of in mine]
-        agree = [1 - float(violation(problem, motions, labelling, s, i).mean()) if len(i) else 0.0 for s, i in enumerate(rows)]
+        agree = [
+            1 - float(violation(problem, motions, labelling, s, i).mean()) if len(i) else 0.0
+            for s, i in enumerate(rows)
+        ]
         middle = problem.surfels[0].points[mine[0]].mean(0).double() if mine[0].any() else problem.centre.double()
         axis = motions.axis[k].double()
         axis = axis / axis.norm()

@@ -1,4 +1,5 @@
-"""Hypotheses with their evidence: what each motion explains of the moved surface, how plausible its joint is, who owns what it lands on."""
+"""Hypotheses with their evidence: what each motion explains of the moved surface, how plausible its joint is, who owns
+what it lands on."""
 
 from __future__ import annotations
 
@@ -14,10 +15,13 @@ from p2gs.motion.discovery.rigid import Motions
 from p2gs.native import native, num_threads
 
 
-def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples: list[Tensor], slide_bonus: bool = True) -> Tensor:
+def plausibility(
+    problem: Problem, motions: Motions, pays: list[Tensor], samples: list[Tensor], slide_bonus: bool = True
+) -> Tensor:
     """Factor [B] in 0..1 on a motion's evidence, from what joints of made things are like.
 
-    * A hinge touches what it carries: distance from the axis to the points that pay, less what must stay unseen near an axis.
+    * A hinge touches what it carries: distance from the axis to the points that pay, less what must stay unseen near an
+      axis.
     * A part's faces lie along or across its joint's axis: share of paying points whose normals are oblique to it.
     * A motion of hardly more than the tolerance is what errors of the surfaces look like.
     * Large motions are a little less likely than small ones; a turn has two freedoms more than a slide.
@@ -29,7 +33,9 @@ def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples
     excess = (near - 0.04 * k.diag - unseen).clamp(0, k.diag)
     turn = 1 - cfg.attach * (excess / (0.12 * k.diag)).clamp(0, 1)
     turn = (
-        turn * (1 - 0.15 * ((motions.amount.abs() - math.radians(80)) / math.radians(55)).clamp(0, 1)) * (1 - cfg.slide_bonus * slide_bonus)
+        turn
+        * (1 - 0.15 * ((motions.amount.abs() - math.radians(80)) / math.radians(55)).clamp(0, 1))
+        * (1 - cfg.slide_bonus * slide_bonus)
     )
     size = motions.amount.abs() / (cfg.max_slide * k.diag)
     slide = (1 - 0.08 * size.clamp(0, 1)) * (1 - 2 * (size - 1).clamp(0, 0.5))
@@ -39,9 +45,11 @@ def plausibility(problem: Problem, motions: Motions, pays: list[Tensor], samples
     return out * (1 - torch.where(motions.turn, 0.4, 0.6) * ((oblique / weight - 0.3) / 0.4).clamp(0, 1))
 
 
-def joint_sums_reference(problem: Problem, motions: Motions, pays: list[Tensor], samples: list[Tensor]) -> tuple[Tensor, ...]:
-    """Over the points that each motion pays for, [B] each: distance from its axis to the nearest (but a hundredth of all); shares of
-    oblique normals, mean distance and share of points, both states added."""
+def joint_sums_reference(
+    problem: Problem, motions: Motions, pays: list[Tensor], samples: list[Tensor]
+) -> tuple[Tensor, ...]:
+    """Over the points that each motion pays for, [B] each: distance from its axis to the nearest (but a hundredth of
+    all); shares of oblique normals, mean distance and share of points, both states added."""
     near = torch.full((len(motions),), torch.inf)
     oblique, arm, weight = torch.zeros(len(motions)), torch.zeros(len(motions)), torch.full((len(motions),), 1e-6)
     for s in (0, 1):
@@ -68,7 +76,12 @@ def joint_sums(problem: Problem, motions: Motions, pays: list[Tensor], samples: 
     near = torch.full((len(motions),), torch.inf)
     total = torch.zeros(len(motions), 3)
     for s in (0, 1):
-        rows, index, pay, n = problem.landings[s].rows, samples[s].contiguous(), pays[s].float().contiguous(), len(samples[s])
+        rows, index, pay, n = (
+            problem.landings[s].rows,
+            samples[s].contiguous(),
+            pays[s].float().contiguous(),
+            len(samples[s]),
+        )
         out = torch.empty(len(motions), 4)
         native.evidence_joints(
             rows.data_ptr(), len(rows), index.data_ptr(), n, pay.data_ptr(), axis.data_ptr(), centre.data_ptr(), len(motions),
@@ -82,10 +95,10 @@ def joint_sums(problem: Problem, motions: Motions, pays: list[Tensor], samples: 
 class Pool:
     """Hypotheses with their evidence over the samples of both states.
 
-    pays [B, P0], [B, P1] in 0..1: saturated (a sharper fit of what is explained already is worth nothing here), averaged over a
-    point's neighbours that face alike, times the joint's plausibility.  twin [B, P]: the sample of the other state next to where the
-    point lands.  back [B, P]: what that sample pays under the same motion.  owned, loose [B, P]: does the point land on a moved surface,
-    on one of unknown fate or none at all.
+    pays [B, P0], [B, P1] in 0..1: saturated (a sharper fit of what is explained already is worth nothing here),
+    averaged over a point's neighbours that face alike, times the joint's plausibility.  twin [B, P]: the sample of the
+    other state next to where the point lands.  back [B, P]: what that sample pays under the same motion.  owned, loose
+    [B, P]: does the point land on a moved surface, on one of unknown fate or none at all.
     """
 
     FULL, NONE = 0.16, 0.30  # landing costs that pay all and nothing
@@ -106,8 +119,13 @@ class Pool:
             surf = problem.surfels[s]
             p, n = surf.points[samples[s]], surf.normals[samples[s]]
             tree = cKDTree(p.numpy())
-            d, j = (torch.from_numpy(np.asarray(a).reshape(len(p), -1)) for a in tree.query(p.numpy(), k=min(k, len(p))))
-            w = torch.exp(-((d / d[:, -1].median().clamp_min(1e-9)) ** 2)).float() * (n[j] * n[:, None]).sum(2).clamp_min(0) ** 2
+            d, j = (
+                torch.from_numpy(np.asarray(a).reshape(len(p), -1)) for a in tree.query(p.numpy(), k=min(k, len(p)))
+            )
+            w = (
+                torch.exp(-((d / d[:, -1].median().clamp_min(1e-9)) ** 2)).float()
+                * (n[j] * n[:, None]).sum(2).clamp_min(0) ** 2
+            )
             self.smooth.append(torch.zeros(len(p), len(p)).scatter_(1, j, w / w.sum(1, keepdim=True)).T.contiguous())
             self.closest.append(torch.from_numpy(tree.query(surf.points.numpy())[1]))
 
@@ -141,7 +159,8 @@ class Pool:
         return [p[list(chosen)].max(0).values if len(chosen) else torch.zeros(p.shape[1]) for p in self.pays]
 
     def effective(self, rows: Tensor, others: list[Tensor]) -> list[Tensor]:
-        """Evidence [R, P] of motions ``rows``, less where the landing place is better explained otherwise (``others`` [P] per state)."""
+        """Evidence [R, P] of motions ``rows``, less where the landing place is better explained otherwise (``others``
+        [P] per state)."""
         if native is None or not all(map(len, others)):
             return self.effective_reference(rows, others)
         rows, out = rows.contiguous(), []
@@ -149,7 +168,14 @@ class Pool:
             rival, e = others[1 - s].contiguous(), torch.empty(len(rows), len(self.samples[s]))
             tables = (self.pays[s], self.back[s], self.twin[s], self.owned[s], rival)
             native.evidence_effective(
-                [t.data_ptr() for t in tables], e.shape[1], self.RIVAL, self.SHARED, rows.data_ptr(), len(rows), e.data_ptr(), num_threads()
+                [t.data_ptr() for t in tables],
+                e.shape[1],
+                self.RIVAL,
+                self.SHARED,
+                rows.data_ptr(),
+                len(rows),
+                e.data_ptr(),
+                num_threads(),
             )
             out.append(e)
         return out
@@ -172,22 +198,29 @@ class Pool:
         return [x.max(0).values for x in e]
 
     def total(self, chosen) -> float:
-        """Evidence, 0..1: every point goes to the motion that pays most, both states weighted alike, each part's evidence balanced."""
+        """Evidence, 0..1: every point goes to the motion that pays most, both states weighted alike, each part's
+        evidence balanced."""
         if not len(chosen):
             return 0.0
         rows = torch.tensor(list(chosen))
         shares = self.shares_reference if native is None else self.shares
-        return float(balanced(*(shares(s, e, rows) for s, e in enumerate(self.effective(rows, self.best(chosen))))).sum()) / 2
+        return (
+            float(balanced(*(shares(s, e, rows) for s, e in enumerate(self.effective(rows, self.best(chosen))))).sum())
+            / 2
+        )
 
     def shares(self, state: int, e: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """``shares_reference`` in one pass of a kernel."""
         e, w, out = e.contiguous(), self.problem.weights[state].contiguous(), torch.empty(2, len(rows))
-        native.evidence_shares(e.data_ptr(), w.data_ptr(), self.loose[state].data_ptr(), rows.data_ptr(), *e.shape, out.data_ptr())
+        native.evidence_shares(
+            e.data_ptr(), w.data_ptr(), self.loose[state].data_ptr(), rows.data_ptr(), *e.shape, out.data_ptr()
+        )
         return out[0], out[1]
 
     def shares_reference(self, state: int, e: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Weighted evidence [R] of a state's points that motions ``rows`` get, each the points that it pays most for of e [R, P]: of points
-        that land on a moved surface or a static one, and of those that land on one of unknown fate or none (``loose``)."""
+        """Weighted evidence [R] of a state's points that motions ``rows`` get, each the points that it pays most for of
+        e [R, P]: of points that land on a moved surface or a static one, and of those that land on one of unknown fate
+        or none (``loose``)."""
         value, who = e.max(0)
         value = value * self.problem.weights[state]
         loose = self.loose[state][rows].gather(0, who[None])[0]

@@ -21,9 +21,11 @@ SOFT = 0.10
 
 @dataclass
 class Problem:
-    """surfels, stacks, landings, moved, static and replaced masks by state; ``samples``: indices of the moved surfels the search looks at.
+    """surfels, stacks, landings, moved, static and replaced masks by state; ``samples``: indices of the moved surfels
+    the search looks at.
 
-    trust [N] per state, 0.1..1: how credible it is that a moved surfel moved; ``weights`` [P] per state: that of the samples, sum 1.
+    trust [N] per state, 0.1..1: how credible it is that a moved surfel moved; ``weights`` [P] per state: that of the
+    samples, sum 1.
     """
 
     config: DiscoveryConfig
@@ -40,12 +42,16 @@ class Problem:
     replaced: list[Tensor]
 
     def cost(self, motions: Motions, state: int, index: Tensor, claimed: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Landing cost [B, P] of surfels ``index`` of ``state`` under each motion (start by T, end by T^-1), and what they meet."""
+        """Landing cost [B, P] of surfels ``index`` of ``state`` under each motion (start by T, end by T^-1), and what
+        they meet."""
         return self.landings[1 - state].arrive(motions, self.landings[state], index, state == 1, claimed)
 
-    def pay(self, motions: Motions, samples: list[Tensor] | None = None, chunk: int = 64) -> list[tuple[Tensor, Tensor]]:
-        """Evidence [B, P] by state: how much below ``unexplained`` a point costs; only true arrivals on a surface pay. With it, whether
-        [B, P] the point arrives on a surface that is neither known to have moved nor to have stayed."""
+    def pay(
+        self, motions: Motions, samples: list[Tensor] | None = None, chunk: int = 64
+    ) -> list[tuple[Tensor, Tensor]]:
+        """Evidence [B, P] by state: how much below ``unexplained`` a point costs; only true arrivals on a surface pay.
+        With it, whether [B, P] the point arrives on a surface that is neither known to have moved nor to have
+        stayed."""
         samples = self.samples if samples is None else samples
         out = []
         for s in (0, 1):
@@ -65,8 +71,8 @@ class Problem:
 def balanced(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:
     """Evidence of both states together, each given as (on surfaces of known fate, on surfaces of unknown fate).
 
-    What arrives on a moved surface must be answered from there, so neither state's counts for over three times the other's; a surface
-    of unknown fate (hidden from the other state, or wrongly rebuilt there) cannot answer.
+    What arrives on a moved surface must be answered from there, so neither state's counts for over three times the
+    other's; a surface of unknown fate (hidden from the other state, or wrongly rebuilt there) cannot answer.
     """
     a, b = start[0] + start[1], end[0] + end[1]
     return torch.minimum(start[0], 3 * b + 0.001) + torch.minimum(end[0], 3 * a + 0.001) + start[1] + end[1]
@@ -88,9 +94,9 @@ def evidence_masks(
 ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
     """Per state (moved, static, replaced) [N] bool: tested against the *other* state's depth maps; the rest is unknown.
 
-    What the other state sees through has moved, and so has what has there in its place a surface of another colour (mean difference
-    of the channels above ``recoloured``): it is among the moved, and ``replaced``, as only one of the two need have moved; the other
-    was behind it.
+    What the other state sees through has moved, and so has what has there in its place a surface of another colour
+    (mean difference of the channels above ``recoloured``): it is among the moved, and ``replaced``, as only one of the
+    two need have moved; the other was behind it.
     """
     moved, static, replaced = [], [], []
     for s in (0, 1):
@@ -101,8 +107,11 @@ def evidence_masks(
         d, j = cKDTree(other.points.numpy()).query(surfels[s].points.numpy(), k=min(4, len(other)))
         j = torch.from_numpy(np.asarray(j).reshape(len(surfels[s]), -1))
         d = torch.from_numpy(np.asarray(d).reshape(len(surfels[s]), -1))
-        like = ((other.normals[j] * surfels[s].normals[:, None]).sum(2) > 0.7) & (d < 2 * max(surfels[0].spacing, surfels[1].spacing))
-        # where a door stood shut the open state is often rebuilt with a lid over the opening: the place is taken, the colour is not
+        like = ((other.normals[j] * surfels[s].normals[:, None]).sum(2) > 0.7) & (
+            d < 2 * max(surfels[0].spacing, surfels[1].spacing)
+        )
+        # where a door stood shut the open state is often rebuilt with a lid over the opening: the place is taken, the
+        # colour is not
         near = still & like.any(1) & ~m
         apart = (other.colours[j] - surfels[s].colours[:, None]).abs().mean(2)
         other_colour = torch.where(like, apart, torch.full_like(apart, 9.0)).min(1).values > recoloured
@@ -114,14 +123,17 @@ def evidence_masks(
 
 
 def credibility(surfels: Surfels, other: Surfels, stack: DepthStack, moved: Tensor, scale: Scale) -> Tensor:
-    """[N] 0.1..1: moved surfels that are only just seen through, or have a like surface close by in the other state, may be errors."""
+    """[N] 0.1..1: moved surfels that are only just seen through, or have a like surface close by in the other state,
+    may be errors."""
     index = torch.nonzero(moved)[:, 0]
     out = torch.full((len(surfels),), 0.1)
     if not len(index):
         return out
     p, n = surfels.points[index], surfels.normals[index]
     far = ((stack.excess(p, scale.tau) - 1.3) / 2.0).clamp(0.1, 1)
-    j = torch.from_numpy(np.asarray(cKDTree(other.points.numpy()).query(p.numpy(), k=min(24, len(other)))[1]).reshape(len(p), -1))
+    j = torch.from_numpy(
+        np.asarray(cKDTree(other.points.numpy()).query(p.numpy(), k=min(24, len(other)))[1]).reshape(len(p), -1)
+    )
     d = other.points[j] - p[:, None]
     across = (d * n[:, None]).sum(2).abs()
     along = (d.pow(2).sum(2) - across**2).clamp_min(0).sqrt()
@@ -131,7 +143,8 @@ def credibility(surfels: Surfels, other: Surfels, stack: DepthStack, moved: Tens
 
 
 def disagreement(surfels: list[Surfels], limit: float) -> float:
-    """Robust standard deviation of one state's surface about the other's where both lie within ``limit``: most of it never moved."""
+    """Robust standard deviation of one state's surface about the other's where both lie within ``limit``: most of it
+    never moved."""
     near, j = cKDTree(surfels[1].points.numpy()).query(surfels[0].points.numpy())
     j = torch.from_numpy(j)
     d = ((surfels[1].points[j] - surfels[0].points) * surfels[1].normals[j]).sum(1).abs()
@@ -144,10 +157,15 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
     stacks = [DepthStack(e.depths, e.alphas, e.cameras) for e in (start, end)]
     points = torch.cat([e.points for e in (start, end)])
     box = torch.quantile(
-        points[torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))[:100000]], torch.tensor([0.005, 0.995]), 0
+        points[torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))[:100000]],
+        torch.tensor([0.005, 0.995]),
+        0,
     )
     diag = float((box[1] - box[0]).norm())
-    built = [build_surfels(e, st, diag, config.surfels, config.noise_floor) for e, st in zip((start, end), stacks, strict=False)]
+    built = [
+        build_surfels(e, st, diag, config.surfels, config.noise_floor)
+        for e, st in zip((start, end), stacks, strict=False)
+    ]
     surfels = [b[0] for b in built]
     noise, spacing = max(s.noise for s in surfels), max(s.spacing for s in surfels)
     tau = 3 * noise + 0.2 * spacing

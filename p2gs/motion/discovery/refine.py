@@ -1,6 +1,8 @@
-"""Sharpen motion hypotheses: batched constrained point-to-plane steps, then a derivative-free search on the evidence itself.
+"""Sharpen motion hypotheses: batched constrained point-to-plane steps, then a derivative-free search on the evidence
+itself.
 
-Point-to-plane is blind to sliding within a door's plane; free space is not, so the second step uses the full landing cost.
+Point-to-plane is blind to sliding within a door's plane; free space is not, so the second step uses the full landing
+cost.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ from p2gs.native import native, num_threads
 
 
 def normal_equations(problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], width: float):
-    """J^T W J [B, 5, 5] and J^T W r [B, 5] of both states' point-to-plane residuals, Geman-McClure weights of ``width``."""
+    """J^T W J [B, 5, 5] and J^T W r [B, 5] of both states' point-to-plane residuals, Geman-McClure weights of
+    ``width``."""
     if not all(landing.fused for landing in problem.landings):
         return normal_equations_reference(problem, motions, samples, weights, width)
     A = torch.zeros(len(motions), 5, 5)
@@ -31,7 +34,9 @@ def normal_equations(problem: Problem, motions: Motions, samples: list[Tensor], 
     return A, b
 
 
-def normal_equations_reference(problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], width: float):
+def normal_equations_reference(
+    problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], width: float
+):
     """``normal_equations`` in torch, for machines without the kernels."""
     B = motions.twist_basis()
     A = torch.zeros(len(motions), 5, 5)
@@ -46,7 +51,12 @@ def normal_equations_reference(problem: Problem, motions: Motions, samples: list
         r = ((x - q) * m).sum(2)
         off = (x - q).pow(2).sum(2) - r * r
         w = weights[s] / (1 + (r / width) ** 2) ** 2
-        w = w * (off < (landing.hc + 2 * problem.scale.spacing) ** 2) * ((nx * m).sum(2) > 0.5) * (1 - 0.7 * landing.static[j].float())
+        w = (
+            w
+            * (off < (landing.hc + 2 * problem.scale.spacing) ** 2)
+            * ((nx * m).sum(2) > 0.5)
+            * (1 - 0.7 * landing.static[j].float())
+        )
         if s == 0:
             J = torch.cat([torch.linalg.cross(x, m), m], 2)
         else:  # the residual seen in the end state: plane carried along, point p at rest
@@ -59,9 +69,16 @@ def normal_equations_reference(problem: Problem, motions: Motions, samples: list
 
 
 def gauss_newton(
-    problem: Problem, motions: Motions, samples: list[Tensor], weights: list[Tensor], rounds: int = 8, width0=None, width1=None
+    problem: Problem,
+    motions: Motions,
+    samples: list[Tensor],
+    weights: list[Tensor],
+    rounds: int = 8,
+    width0=None,
+    width1=None,
 ) -> Motions:
-    """A few damped steps with a kernel shrinking from ``width0`` (1.5 coarse voxels) to ``width1`` (the surface tolerance)."""
+    """A few damped steps with a kernel shrinking from ``width0`` (1.5 coarse voxels) to ``width1`` (the surface
+    tolerance)."""
     hc, tp = problem.landings[0].hc, problem.scale.tp
     width0, width1 = width0 or 1.5 * hc, width1 or tp
     unit = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0])
@@ -77,11 +94,19 @@ def gauss_newton(
 
 
 def pattern_search(
-    gain, motions: Motions, length: float, rounds: int = 10, turn_radius: float = 0.4, value: Tensor | None = None, tilt: bool = True
+    gain,
+    motions: Motions,
+    length: float,
+    rounds: int = 10,
+    turn_radius: float = 0.4,
+    value: Tensor | None = None,
+    tilt: bool = True,
 ) -> tuple[Motions, Tensor]:
-    """Coordinate steps (both signs, 5 coordinates), step halved where nothing improves. Returns motions and their gains.
+    """Coordinate steps (both signs, 5 coordinates), step halved where nothing improves. Returns motions and their
+    gains.
 
-    length: first step in scene units; angles step by length / turn_radius. gain: Motions [B] -> [B].  tilt: may the axis turn.
+    length: first step in scene units; angles step by length / turn_radius. gain: Motions [B] -> [B].  tilt: may the
+    axis turn.
     """
     B = len(motions)
     value = gain(motions) if value is None else value

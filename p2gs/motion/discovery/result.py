@@ -16,8 +16,9 @@ from p2gs.visibility.surfels import Surfels
 
 @dataclass(frozen=True)
 class FoundMotion:
-    """One moving part. transform [4, 4] float64 start -> end; axis [3] unit and origin [3] (on the axis; of a slide: a point of the part);
-    amount: degrees (revolute) or length along the axis, signed; confidence 0..1; mass: share of the moved surface it explains."""
+    """One moving part. transform [4, 4] float64 start -> end; axis [3] unit and origin [3] (on the axis; of a slide: a
+    point of the part); amount: degrees (revolute) or length along the axis, signed; confidence 0..1; mass: share of the
+    moved surface it explains."""
 
     type: JointType
     transform: Tensor
@@ -30,7 +31,8 @@ class FoundMotion:
 
 @dataclass
 class Candidate:
-    """A complete explanation. score: lower is better (image-space violation plus the price of parts and implausible joints).
+    """A complete explanation. score: lower is better (image-space violation plus the price of parts and implausible
+    joints).
 
     probability: per state [M, K + 1] over the state's surfels (column 0 static).
     """
@@ -42,10 +44,14 @@ class Candidate:
     labels_start: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
     labels_end: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
 
-    def label_points(self, points: Tensor, colours: Tensor | None, state: int, neighbours: int = 5) -> tuple[Tensor, Tensor]:
-        """Labels [N] int64 and margin [N] in 0..1 of any points [N, 3] of ``state`` (0 start, 1 end): the nearest surfels decide.
+    def label_points(
+        self, points: Tensor, colours: Tensor | None, state: int, neighbours: int = 5
+    ) -> tuple[Tensor, Tensor]:
+        """Labels [N] int64 and margin [N] in 0..1 of any points [N, 3] of ``state`` (0 start, 1 end): the nearest
+        surfels decide.
 
-        colours [N, 3] (or None) favour surfels that look alike. The margin falls with the distance to the nearest surfel.
+        colours [N, 3] (or None) favour surfels that look alike. The margin falls with the distance to the nearest
+        surfel.
         """
         p, d = self.point_probability(points, colours, state, neighbours)
         label = p.argmax(1)
@@ -55,7 +61,9 @@ class Candidate:
         near = torch.exp(-((d / (3 * self.surfels[state].spacing)) ** 2))
         return label, (top[:, 0] - top[:, 1]) * near
 
-    def point_probability(self, points: Tensor, colours: Tensor | None, state: int, neighbours: int = 5) -> tuple[Tensor, Tensor]:
+    def point_probability(
+        self, points: Tensor, colours: Tensor | None, state: int, neighbours: int = 5
+    ) -> tuple[Tensor, Tensor]:
         """Probabilities [N, K + 1] of any points and the distance [N] to the nearest surfel."""
         surf = self.surfels[state]
         d, j = cKDTree(surf.points.numpy()).query(points.detach().cpu().float().numpy(), k=min(neighbours, len(surf)))
@@ -72,8 +80,8 @@ class Candidate:
 class Discovery(Candidate):
     """The best explanation, the runners-up and what led there.
 
-    margin_start, margin_end [N]: confidence of the labels of the input points.  evidence_start, evidence_end [N] int: 1 moved,
-    0 static, -1 unknown.  candidates: complete explanations, best first, this one included.  diagnostics: each
+    margin_start, margin_end [N]: confidence of the labels of the input points.  evidence_start, evidence_end [N] int: 1
+    moved, 0 static, -1 unknown.  candidates: complete explanations, best first, this one included.  diagnostics: each
     stage's own measure.  problem, graphs, search: what was searched and how, for ``relabel`` and ``instead_of``.
     """
 

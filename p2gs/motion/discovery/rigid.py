@@ -28,9 +28,10 @@ def perpendicular(axis: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass
 class Motions:
-    """B motions start -> end. turn [B] bool (revolute); axis [B, 3] unit; centre [B, 3] a point on the axis (unused by slides);
-    amount [B]: radians or scene units, signed along the axis.  thick [B]: thickness (scene units) of the plate that moves, of which one
-    state may show one side and the other state the other; 0 (the default): sides are told apart by nothing but themselves."""
+    """B motions start -> end. turn [B] bool (revolute); axis [B, 3] unit; centre [B, 3] a point on the axis (unused by
+    slides); amount [B]: radians or scene units, signed along the axis.  thick [B]: thickness (scene units) of the plate
+    that moves, of which one state may show one side and the other state the other; 0 (the default): sides are told
+    apart by nothing but themselves."""
 
     turn: Tensor
     axis: Tensor
@@ -50,14 +51,17 @@ class Motions:
 
     @staticmethod
     def cat(items: list["Motions"]) -> "Motions":
-        return Motions(*(torch.cat([getattr(m, n) for m in items]) for n in ("turn", "axis", "centre", "amount", "thick")))
+        return Motions(
+            *(torch.cat([getattr(m, n) for m in items]) for n in ("turn", "axis", "centre", "amount", "thick"))
+        )
 
     @staticmethod
     def empty() -> "Motions":
         return Motions(torch.zeros(0, dtype=torch.bool), torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
 
     def packed(self) -> list[Tensor]:
-        """turn, axis, centre, amount as the kernels take them, contiguous; the caller keeps them while their addresses are in use."""
+        """turn, axis, centre, amount as the kernels take them, contiguous; the caller keeps them while their addresses
+        are in use."""
         parts = [self.turn, self.axis, self.centre, self.amount]
         return [x.contiguous() if x.dtype in (torch.float32, torch.bool) else x.float().contiguous() for x in parts]
 
@@ -72,7 +76,11 @@ class Motions:
     def matrices_reference(self) -> tuple[Tensor, Tensor]:
         """``matrices`` in torch, in the motions' own dtype."""
         R = rotation(self.axis, torch.where(self.turn, self.amount, torch.zeros_like(self.amount)))
-        t = torch.where(self.turn[:, None], self.centre - torch.einsum("bij,bj->bi", R, self.centre), self.axis * self.amount[:, None])
+        t = torch.where(
+            self.turn[:, None],
+            self.centre - torch.einsum("bij,bj->bi", R, self.centre),
+            self.axis * self.amount[:, None],
+        )
         return R, t
 
     def transform(self, i: int) -> Tensor:
@@ -100,15 +108,22 @@ class Motions:
     def displaced(self, step: Tensor) -> "Motions":
         """Add a step [B, 5] in each motion's own coordinates.
 
-        Turns: angle (rad), tilt about e1, e2 (rad, about the centre), centre along e1, e2.  Slides: amount, sideways e1, e2, -, -.
-        Zero pitch and zero rotation hold by construction.
+        Turns: angle (rad), tilt about e1, e2 (rad, about the centre), centre along e1, e2.  Slides: amount, sideways
+        e1, e2, -, -. Zero pitch and zero rotation hold by construction.
         """
         if native is None or self.amount.dtype != torch.float32:
             return self.displaced_reference(step)
         moving, step = self.packed(), step.float().contiguous()
-        out = Motions(self.turn, torch.empty(len(self), 3), torch.empty(len(self), 3), torch.empty(len(self)), self.thick)
+        out = Motions(
+            self.turn, torch.empty(len(self), 3), torch.empty(len(self), 3), torch.empty(len(self)), self.thick
+        )
         native.motion_displaced(
-            [m.data_ptr() for m in moving], len(self), step.data_ptr(), out.axis.data_ptr(), out.centre.data_ptr(), out.amount.data_ptr()
+            [m.data_ptr() for m in moving],
+            len(self),
+            step.data_ptr(),
+            out.axis.data_ptr(),
+            out.centre.data_ptr(),
+            out.amount.data_ptr(),
         )
         return out
 
@@ -122,7 +137,9 @@ class Motions:
         slide = self.axis * (self.amount + step[:, 0])[:, None] + tilt
         length = slide.norm(dim=1)
         sign = torch.where((slide * self.axis).sum(1) < 0, -1.0, 1.0)
-        axis_slide = torch.where(length[:, None] > 1e-9, slide / length.clamp_min(1e-9)[:, None] * sign[:, None], self.axis)
+        axis_slide = torch.where(
+            length[:, None] > 1e-9, slide / length.clamp_min(1e-9)[:, None] * sign[:, None], self.axis
+        )
         turn = self.turn[:, None]
         return Motions(
             self.turn,
@@ -133,7 +150,8 @@ class Motions:
         )
 
     def twist_basis(self) -> Tensor:
-        """[B, 6, 5]: left twist (omega, v) of T, x -> x + omega x x + v, per unit of each coordinate of ``displaced``."""
+        """[B, 6, 5]: left twist (omega, v) of T, x -> x + omega x x + v, per unit of each coordinate of
+        ``displaced``."""
         R, t = self.matrices()
         e1, e2 = perpendicular(self.axis)
         zero = torch.zeros_like(e1)
@@ -158,12 +176,23 @@ class Motions:
         return torch.where(self.turn[:, None, None], turn, slide)
 
     def swept(self, points: Tensor, other: "Motions") -> Tensor:
-        """Root mean square distance between the images of points [P, 3] under every motion here and every other: [B, C]."""
-        if native is None or not len(points) or not points.dtype == self.amount.dtype == other.amount.dtype == torch.float32:
+        """Root mean square distance between the images of points [P, 3] under every motion here and every other: [B,
+        C]."""
+        if (
+            native is None
+            or not len(points)
+            or not points.dtype == self.amount.dtype == other.amount.dtype == torch.float32
+        ):
             return self.swept_reference(points, other)
         a, b, points, out = self.packed(), other.packed(), points.contiguous(), torch.empty(len(self), len(other))
         native.motion_swept(
-            [m.data_ptr() for m in a], len(self), [m.data_ptr() for m in b], len(other), points.data_ptr(), len(points), out.data_ptr()
+            [m.data_ptr() for m in a],
+            len(self),
+            [m.data_ptr() for m in b],
+            len(other),
+            points.data_ptr(),
+            len(points),
+            out.data_ptr(),
         )
         return out
 

@@ -1,8 +1,8 @@
 """Which set of motions explains the moved surface of both states: a pool of sharp hypotheses, then joint selection.
 
-The value of a set S is  sum_s mean_i max_{k in S} pay_s(i, k)  -  cost * |S|, each part's pay scaled by how plausible its joint is.
-A greedy pass only fills the pool; sets are improved by adding, dropping and swapping until nothing helps, and every part is fitted
-again to what the others leave over.
+The value of a set S is  sum_s mean_i max_{k in S} pay_s(i, k)  -  cost * |S|, each part's pay scaled by how plausible
+its joint is. A greedy pass only fills the pool; sets are improved by adding, dropping and swapping until nothing helps,
+and every part is fitted again to what the others leave over.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ THICKNESSES = 8  # of plates that are tried
 
 
 def two_sided(problem: Problem, motions: Motions, gain: Callable[[Motions], Tensor]) -> Motions:
-    """The motions with the thickness of plate under which ``gain`` [B] is greatest; slides show the same sides in both states: 0."""
+    """The motions with the thickness of plate under which ``gain`` [B] is greatest; slides show the same sides in both
+    states: 0."""
     turns = motions.turn.nonzero()[:, 0]
     if not len(turns):
         return motions
@@ -66,13 +67,19 @@ class Search:
         self.sweep_rows = [s.argsort()[w] for s, w in zip(self.samples, where, strict=False)]
         self.trace: list[dict] = []
 
-    def propose(self, chosen: list[int], count: int, fine: int, extra: Motions | None = None, each: bool = False) -> tuple[Motions, Tensor]:
+    def propose(
+        self, chosen: list[int], count: int, fine: int, extra: Motions | None = None, each: bool = False
+    ) -> tuple[Motions, Tensor]:
         """The ``fine`` best sharpened motions for what the motions ``chosen`` leave over, and their gains.
 
-        each: as many slides as turns, since among many turns one often fits by chance a little better than a true slide.
+        each: as many slides as turns, since among many turns one often fits by chance a little better than a true
+        slide.
         """
         left = [(1 - a).clamp(0, 1) for a in self.pool.explained(chosen)]
-        weights = [(x * w)[r] / w[r].sum().clamp_min(1e-9) for x, w, r in zip(left, self.problem.weights, self.sweep_rows, strict=False)]
+        weights = [
+            (x * w)[r] / w[r].sum().clamp_min(1e-9)
+            for x, w, r in zip(left, self.problem.weights, self.sweep_rows, strict=False)
+        ]
         g = self.swept.gain(weights)
         slide = ~self.swept.motions.turn
         tops = [
@@ -85,10 +92,16 @@ class Search:
             motions = Motions.cat([motions, extra])
         if len(motions) == 0:
             return motions, torch.zeros(0)
-        return self.sharpened(motions, ExclusiveGain(self.problem, self.samples, [w * x for w, x in zip(self.problem.weights, left, strict=True)]), fine, each)
+        return self.sharpened(
+            motions,
+            ExclusiveGain(self.problem, self.samples, [w * x for w, x in zip(self.problem.weights, left, strict=True)]),
+            fine,
+            each,
+        )
 
     def sharpened(self, motions: Motions, gain: ExclusiveGain, fine: int, each: bool = False) -> tuple[Motions, Tensor]:
-        """The ``fine`` motions of greatest gain that come of ``motions`` [B] when fitted to the gain's samples, and their gains."""
+        """The ``fine`` motions of greatest gain that come of ``motions`` [B] when fitted to the gain's samples, and
+        their gains."""
         motions = two_sided(self.problem, motions, gain)
         sharp = gauss_newton(self.problem, motions, gain.samples, gain.weights)
         both = Motions.cat([motions, sharp])
@@ -128,7 +141,11 @@ class Search:
         twins = 0
         if len(chosen) > 1:
             m = self.pool.motions[torch.tensor(list(chosen))]
-            twins = int((m.swept(self.probe, m).triu(1) + torch.ones(len(chosen), len(chosen)).tril() * 9 < self.radius).any(0).sum())
+            twins = int(
+                (m.swept(self.probe, m).triu(1) + torch.ones(len(chosen), len(chosen)).tril() * 9 < self.radius)
+                .any(0)
+                .sum()
+            )
         return self.pool.total(chosen) - self.cost * (len(chosen) + twins)
 
     def additions(self, rest: list[int], top: int = 6) -> list[tuple[float, list[int]]]:
@@ -137,7 +154,11 @@ class Search:
         rows = torch.arange(len(self.pool.motions))
         e = self.pool.effective(rows, best)
         guess = self.pool.mean([(x - a).clamp_min(0) for x, a in zip(e, already, strict=False)])
-        return [(self.value([*rest, k]), [*rest, k]) for k in guess.topk(min(top, len(guess))).indices.tolist() if k not in rest]
+        return [
+            (self.value([*rest, k]), [*rest, k])
+            for k in guess.topk(min(top, len(guess))).indices.tolist()
+            if k not in rest
+        ]
 
     def improve(self, chosen: list[int]) -> list[int]:
         """Add, drop or swap hypotheses of the pool while the value of the set rises."""
@@ -156,7 +177,8 @@ class Search:
             best, chosen = value, candidate
 
     def refit(self, chosen: list[int], count: int = 24) -> list[int]:
-        """Fit every part anew to what the others leave over; its own motion is among the starts. New fits join the pool."""
+        """Fit every part anew to what the others leave over; its own motion is among the starts. New fits join the
+        pool."""
         chosen = list(chosen)
         for i in range(len(chosen)):
             rest = chosen[:i] + chosen[i + 1 :]
@@ -182,11 +204,14 @@ class Search:
             found += [self.improve(self.refit(f)) for f in found]
             found += [self.improve(f) for f in found]
         found = self.unique(found)
-        self.trace.append({"pool": len(self.pool.motions), "sets": [(round(self.value(f), 4), len(f)) for f in found[:8]]})
+        self.trace.append(
+            {"pool": len(self.pool.motions), "sets": [(round(self.value(f), 4), len(f)) for f in found[:8]]}
+        )
         return [(self.value(f), f) for f in found]
 
     def alternatives(self, solutions: list[tuple[float, list[int]]], count: int = 2) -> list[tuple[float, list[int]]]:
-        """The best explanation with one motion exchanged for the best really different one: what a later, sharper look may prefer."""
+        """The best explanation with one motion exchanged for the best really different one: what a later, sharper look
+        may prefer."""
         if not solutions:
             return []
         chosen, m = solutions[0][1], self.pool.motions
@@ -198,7 +223,9 @@ class Search:
             e = self.pool.effective(torch.arange(len(m)), best)
             guess = self.pool.mean([(x - a).clamp_min(0) for x, a in zip(e, already, strict=False)])
             guess = torch.where(far, guess, torch.full_like(guess, -1.0))
-            options = [(self.value([*rest, i]), [*rest, i]) for i in guess.topk(min(4, len(guess))).indices.tolist() if far[i]]
+            options = [
+                (self.value([*rest, i]), [*rest, i]) for i in guess.topk(min(4, len(guess))).indices.tolist() if far[i]
+            ]
             if options:
                 out.append(max(options))
         found = [f for _, f in sorted(out, reverse=True)]
@@ -227,4 +254,6 @@ class Search:
         d = a.swept(self.probe, b)
         if len(a) > 7:
             return bool((d.min(1).values < self.radius).all())
-        return any(all(float(d[i, j]) < self.radius for i, j in enumerate(p)) for p in itertools.permutations(range(len(b))))
+        return any(
+            all(float(d[i, j]) < self.radius for i, j in enumerate(p)) for p in itertools.permutations(range(len(b)))
+        )

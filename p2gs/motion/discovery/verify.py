@@ -1,4 +1,5 @@
-"""Image-space check of a complete explanation: every point carried to the other state must agree with what that state shows there."""
+"""Image-space check of a complete explanation: every point carried to the other state must agree with what that state
+shows there."""
 
 from __future__ import annotations
 
@@ -13,14 +14,17 @@ from p2gs.motion.discovery.rigid import Motions
 
 WRONG = 1.0  # cost of a point that something contradicts; hidden space costs what it does where motions are searched
 NEIGHBOURS = 6  # surfels of the other state, one of which must be of the same part where a point lands on a surface
-STILL = 0.3  # weight of a point that is said to move but is not known to: its error is the neighbour's rather than the motion's
+# weight of a point that is said to move but is not known to: its error is the neighbour's rather than the motion's
+STILL = 0.3
 
 
-def violation(problem: Problem, motions: Motions, labelling: Labelling, state: int, index: Tensor, views: int = 32) -> Tensor:
-    """Cost [M] in 0..1 of the labelled surfels ``index`` [M] of ``state``: the share of the other state's views that see through where a
-    point is predicted, of those not blocked by something in front; where they see a surface that is of another part or another colour, as
-    wrong as empty space (of a plate's other side, ``motions.thick`` away, colours tell nothing); ``Landing.HIDDEN`` where all are blocked.
-    A moved point that is called static is wrong."""
+def violation(
+    problem: Problem, motions: Motions, labelling: Labelling, state: int, index: Tensor, views: int = 32
+) -> Tensor:
+    """Cost [M] in 0..1 of the labelled surfels ``index`` [M] of ``state``: the share of the other state's views that
+    see through where a point is predicted, of those not blocked by something in front; where they see a surface that is
+    of another part or another colour, as wrong as empty space (of a plate's other side, ``motions.thick`` away, colours
+    tell nothing); ``Landing.HIDDEN`` where all are blocked. A moved point that is called static is wrong."""
     surf, stack, other = problem.surfels[state], problem.stacks[1 - state], problem.surfels[1 - state]
     labels = labelling.labels(state)[index]
     x, n, thick = surf.points[index].clone(), surf.normals[index].clone(), torch.zeros(len(index))
@@ -31,7 +35,9 @@ def violation(problem: Problem, motions: Motions, labelling: Labelling, state: i
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(views))
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
     d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
-    like = (labelling.labels(1 - state)[j] == labels[:, None]) & (d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None])
+    like = (labelling.labels(1 - state)[j] == labels[:, None]) & (
+        d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None]
+    )
     other_side = ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
     like &= other_side | ((other.colours[j] - surf.colours[index][:, None]).abs().mean(2) < problem.config.recoloured)
     through = free / (free + on).clamp_min(1)
@@ -41,7 +47,8 @@ def violation(problem: Problem, motions: Motions, labelling: Labelling, state: i
 
 
 def image_score(problem: Problem, motions: Motions, labelling: Labelling) -> float:
-    """Mean violation over the points that moved or are said to move, of both states together: 0 is a perfect explanation."""
+    """Mean violation over the points that moved or are said to move, of both states together: 0 is a perfect
+    explanation."""
     total = mass = 0.0
     for s in (0, 1):
         index = (problem.moved[s] | (labelling.labels(s) > 0)).nonzero()[:, 0]

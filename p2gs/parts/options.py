@@ -1,0 +1,46 @@
+"""Options of part discovery."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from p2gs.motion.discovery import DiscoveryConfig
+from p2gs.motion.screw_polish import PolishConfig
+
+
+@dataclass
+class PartMotionsConfig:
+    """Options of part discovery.
+
+    evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
+    candidates: how many complete explanations, and later changes of one kind, are compared by re-rendering; of more explanations those that
+    look best at a glance, after ``look_steps`` of refinement at the smallest size.
+    coarse: photometric refinement right after discovery.
+    compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
+    freedom_penalty: relative image loss by which a turn must win against a slide.
+    same_motion: two touching parts whose motions carry them this near to each other (internal units) are tried as one.
+    survey: shifts within its own surface tried for each part (internal units; [] = none).
+    part_penalty: share of the image loss that each part must save, or goes, and that one which is added or halved must save when parts are
+    reconsidered. On ten objects junk saved at most 1.6 %, true parts 6 % and more, the second of two stacked doors 3 %.
+    islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
+    (0 = off).  rounds: how often labels, types and motions are settled anew.
+    reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched again amid the others,
+    refined, and taken where the energy falls.
+    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
+    """
+
+    evidence_size: int = 200
+    min_opacity: float = 0.5
+    candidates: int = 3
+    look_steps: int = 40
+    compare_types_below: float = 45.0
+    freedom_penalty: float = 0.002
+    same_motion: float = 0.04
+    part_penalty: float = 0.02
+    survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
+    islands: float = 0.25
+    rounds: int = 2
+    reconsider: bool = True
+    min_confidence: float = 0.02
+    search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
+    coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))
