@@ -88,7 +88,7 @@ def read_run(folder: Path, cell: dict, scene: dict) -> Run:
 
 
 def read_metrics(run: Run, metrics: dict) -> None:
-    """Take what the tables need out of a metrics.json (``export.evaluate`` says what is in it)."""
+    """Take what the tables need out of a metrics.json (``scores.evaluate`` says what is in it)."""
     joints = metrics.get("joints")
     if joints:
         run.slides_only = all(j["type"] == "prismatic" for j in joints["joints"])

@@ -39,7 +39,7 @@ def write_diagnosis(
     twin_backend: str | None = None,
     device="cpu",
 ) -> dict:
-    """Measure, judge, draw and write: what the end of every fit does. Parameters as of ``models.diagnosis.diagnose``,
+    """Measure, judge, draw and write: what the end of every fit does. Parameters as of ``diagnosis.measures.diagnose``,
     twin in internal units. Returns what the JSON holds."""
     d = diagnose(stages, twin, views, min_margin=min_margin, backend=backend, twin_backend=twin_backend, device=device)
     strips = diagnostic_strips(stages, twin, views, min_margin, backend)
@@ -51,7 +51,7 @@ def write_diagnostics(
 ) -> dict:
     """Both files; returns what the JSON holds.
 
-    diagnosis: of ``models.diagnosis.diagnose``.  strips: (stage, text, picture).  diagonal: of the object's box, input
+    diagnosis: of ``diagnosis.measures.diagnose``.  strips: (stage, text, picture).  diagonal: of the object's box, input
     units. Losses at the start and end of each training stage come from RUN/logs (left out where nothing was logged).
     """
     run_dir = Path(run_dir)

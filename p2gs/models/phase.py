@@ -76,7 +76,7 @@ class Phase(LightningModule, Stage):
         raise NotImplementedError
 
     def hand_over(self) -> Any:
-        """The result of the phase, a dataclass of ``models.handover``."""
+        """The result of the phase, a dataclass of ``gaussians.handover``."""
         raise NotImplementedError
 
     def preview(self, times: list[float]) -> dict[str, Tensor]:

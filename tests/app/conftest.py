@@ -33,7 +33,7 @@ def fakes(monkeypatch):
     """Registries filled with: losses render, part, contact; callbacks progress, count; phases first, second; data
     folder, made."""
     from p2gs.callbacks.base import CALLBACKS, Callback, register_callback
-    from p2gs.config.run import run as config
+    from p2gs.config import run as config
     from p2gs.data.base import DATASETS
     from p2gs.losses.base import LOSSES, Loss, register_loss
     from p2gs.models.phase import PHASES

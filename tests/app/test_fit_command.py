@@ -25,7 +25,7 @@ def pipeline(monkeypatch):
     calls = []
     module = SimpleNamespace(run=lambda cfg, only=None, keep_stale=False: calls.append((cfg, only)) or cfg.run_dir)
     monkeypatch.setitem(sys.modules, "p2gs.runtime.pipeline", module)
-    monkeypatch.setattr(sys.modules["p2gs"], "pipeline", module, raising=False)
+    monkeypatch.setattr("p2gs.runtime.pipeline", module, raising=False)
     return calls
 
 
