@@ -173,7 +173,8 @@ def fit(file: Path) -> None:
     for name, p in (("left out", guess), ("before", old)):
         brier = float((weight @ (p - right) ** 2) / weight.sum())
         print(
-            f"{name}: Brier {brier:.3f}, right over 0.5 {np.mean(p[right] > 0.5):.2f}, wrong over 0.5 {np.mean(p[~right] > 0.5):.2f}"
+            f"{name}: Brier {brier:.3f}, right over 0.5 {np.mean(p[right] > 0.5):.2f}, wrong over 0.5 "
+            f"{np.mean(p[~right] > 0.5):.2f}"
         )
     print("weights", [round(float(v), 3) for v in fitted(x, right, weight)])
 

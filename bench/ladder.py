@@ -152,9 +152,16 @@ class Case:
         """Discovery as a run does it. Returns PartMotions and seconds."""
         clock = time.perf_counter()
         motions = find_part_motions(
-            self.states, self.scene, self.pipeline.views, self.cfg.num_parts, self.cfg.phases["discovery"].config, seed=self.cfg.seed,
-            backend=self.cfg.rasterizer, device=self.pipeline.device, report=report,
-        )  # fmt: skip
+            self.states,
+            self.scene,
+            self.pipeline.views,
+            self.cfg.num_parts,
+            self.cfg.phases["discovery"].config,
+            seed=self.cfg.seed,
+            backend=self.cfg.rasterizer,
+            device=self.pipeline.device,
+            report=report,
+        )
         return motions, time.perf_counter() - clock
 
 

@@ -20,12 +20,14 @@ Any option of the config can follow as --key.of.it VALUE; null switches a loss o
   --data.root DIR  --data.format artgs|dta|paris|synthetic  --phases.articulation.losses.contact null
   --phases.articulation.losses.part.weight 0.3  --callbacks.previews.every 500
 
---print_config shows every option with its value. A run that was interrupted goes on when the same command is given again.
+--print_config shows every option with its value. A run that was interrupted goes on when the same command is given
+again.
 """
 
 BENCH_HELP = """\
-Options of the runs follow as --key.of.it VALUE and go to every fit: --phases.single_state.steps 500. A bench that was stopped goes on
-when the same command is given again; runs that have their scores are not run again. p2gs table makes the tables.
+Options of the runs follow as --key.of.it VALUE and go to every fit: --phases.single_state.steps 500. A bench that was
+stopped goes on when the same command is given again; runs that have their scores are not run again. p2gs table makes
+the tables.
 """
 
 

@@ -32,7 +32,10 @@ def lightning_main(argv: Optional[Sequence[str]] = None) -> int:
     owner = _sdk_entry_point()
     if owner is None:
         known = ", ".join(COMMANDS)
-        message = f"'{words[0]}' is no command of p2gs ({known}), and {SDK}, whose 'lightning' might know it, is not installed"
+        message = (
+            f"'{words[0]}' is no command of p2gs ({known}), and {SDK}, whose 'lightning' might know it, is not "
+            "installed"
+        )
         print(f"error: {message}", file=sys.stderr)
         return 2
     sys.argv = ["lightning", *words]

@@ -47,7 +47,8 @@ def locked(run_dir: Path) -> Iterator[None]:
                 waited, gone = time.monotonic() - began, _gone(pid, host)
                 if waited > (PATIENCE if gone else GRACE):
                     raise UserError(
-                        f"{run_dir}: another fit is running in this folder (process {pid} on {host}); wait until it has ended, "
+                        f"{run_dir}: another fit is running in this folder (process {pid} on {host}); wait until it "
+                        "has ended, "
                         "or name another folder with --run"
                     ) from None
                 if gone and not told:

@@ -36,7 +36,8 @@ class Display:
         self.began: dict[str, float] = {}
         before = sum(s == "done" for s in known.values())
         print(
-            f"{self.bench.options.name}: {len(known)} runs, {before} done before; results in {self.bench.options.folder}",
+            f"{self.bench.options.name}: {len(known)} runs, {before} done before; results in "
+            f"{self.bench.options.folder}",
             flush=True,
         )
         if not self.terminal:

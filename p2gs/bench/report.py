@@ -112,7 +112,8 @@ def summary(results: Results) -> Grid:
 
 #
 #
-# -- tests -------------------------------------------------------------------------------------------------------------------------
+#
+# -- tests ------------------------------------------------------------------------------------------------------------
 
 
 def ours(results: Results, setting: str, column: str, metric: str) -> Optional[Sample]:
@@ -181,14 +182,18 @@ def write_tests(path: Path, tests: list[Test]) -> Path:
 def significance(tests: list[Test]) -> str:
     """Counts by pair of methods."""
     if not tests:
-        return "## Significance\n\nNo pair of methods has a spread on both sides (give at least two seeds), so nothing was tested.\n"
+        return (
+            "## Significance\n\nNo pair of methods has a spread on both sides (give at least two seeds), so "
+            "nothing was tested.\n"
+        )
     counts: dict[tuple[str, str, str], Counter] = {}
     for x in tests:
         counts.setdefault((x.table, x.a, x.b), Counter())[x.verdict] += 1
     lines = [
         "## Significance",
         "",
-        "Welch's t-test, two-sided, p < 0.05, over object-metric pairs in which every joint was found. Not corrected for their number.",
+        "Welch's t-test, two-sided, p < 0.05, over object-metric pairs in which every joint was found. Not corrected "
+        "for their number.",
         "A published spread of 0.00 is taken as half its last digit, so equal digits do not become certainty.",
         "",
         "| Table | Method | Against | better | no difference | worse |",
@@ -201,7 +206,8 @@ def significance(tests: list[Test]) -> str:
 
 #
 #
-# -- the page ----------------------------------------------------------------------------------------------------------------------
+#
+# -- the page ---------------------------------------------------------------------------------------------------------
 
 
 def write_runs(path: Path, results: Results) -> Path:
@@ -233,12 +239,16 @@ def notes(results: Results, plotted: bool) -> str:
     lines = [
         "## Notes",
         "",
-        "- Mean ± standard deviation over seeds. Ang Err in degrees; Pos Err in tenths of the scene's unit, a prismatic joint",
-        "  counting as 0 (as in the published tables); Motion Err in degrees or units, averaged over both kinds of joint;",
+        "- Mean ± standard deviation over seeds. Ang Err in degrees; Pos Err in tenths of the scene's unit, a "
+        "prismatic joint",
+        "  counting as 0 (as in the published tables); Motion Err in degrees or units, averaged over both kinds of "
+        "joint;",
         "  Chamfer distances squared, both directions, x1000.",
-        "- F k/n: k of n joints (over all seeds) were not found or have the wrong type; the number beside it is the mean of the others.",
+        "- F k/n: k of n joints (over all seeds) were not found or have the wrong type; the number beside it is the "
+        "mean of the others.",
         "- Best of each object and metric in bold, as printed; numbers beside an F do not compete.",
-        "- Sampling floor: what the true surface scores against another sampling of itself; differences below it mean nothing.",
+        "- Sampling floor: what the true surface scores against another sampling of itself; differences below it "
+        "mean nothing.",
         "- Times are of the machine that ran the bench; the published ones are of a GPU.",
     ]
     if not plotted:

@@ -55,7 +55,8 @@ def published_section() -> str:
     lines = [
         "## The paper's own test: Part2GS against ArtGS, both as published",
         "",
-        "Welch's t-test, two-sided, p < 0.05, n = 3. ArtGS-Multi and DTA-Multi print no spreads; there the least spread decides.",
+        "Welch's t-test, two-sided, p < 0.05, n = 3. ArtGS-Multi and DTA-Multi print no spreads; there the least "
+        "spread decides.",
         "",
         "| Count | pairs | better | no difference | worse |",
         "|---|---:|---:|---:|---:|",

@@ -51,7 +51,8 @@ def synth(args: argparse.Namespace) -> int:
     given = {k: v for k, v in given.items() if v is not None}
     folder = synthesize(args.out, seed=args.seed, kind=args.kind, format=args.format, depth=not args.no_depth, **given)
     print(
-        f"{folder}: written; train on it with: p2gs fit -c preset/cpu.yaml -c data/{args.format}.yaml --data.root {folder}"
+        f"{folder}: written; train on it with: p2gs fit -c preset/cpu.yaml -c data/{args.format}.yaml --data.root "
+        f"{folder}"
     )
     return 0
 
@@ -87,6 +88,7 @@ def capture(args: argparse.Namespace) -> int:
         Path(args.start), Path(args.end), Path(args.out), options, progress=lambda text: print(text, flush=True)
     )
     print(
-        f"{folder}: written; look at capture.html there, then: p2gs fit -c preset/cpu.yaml -c data/artgs.yaml --data.root {folder}"
+        f"{folder}: written; look at capture.html there, then: p2gs fit -c preset/cpu.yaml -c data/artgs.yaml "
+        f"--data.root {folder}"
     )
     return 0

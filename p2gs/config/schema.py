@@ -122,7 +122,8 @@ def plain(value: Any) -> Any:
 
 #
 #
-# -- mistakes, told in a sentence --------------------------------------------------------------------------------------------------
+#
+# -- mistakes, told in a sentence -------------------------------------------------------------------------------------
 
 
 def check_keys(tree: Plain, keys: Keys, where: str = "") -> None:

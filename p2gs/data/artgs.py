@@ -118,7 +118,8 @@ def index(root: Path, report: Report) -> list[Frame]:
                     K, fov = intrinsics
                     if entry.get("time") not in (None, state):
                         report.note(
-                            f"{where} has time {short(entry['time'])}, but it is read as state {state} by the file's name"
+                            f"{where} has time {short(entry['time'])}, but it is read as state {state} by the file's "
+                            "name"
                         )
                     frames.append(
                         Frame(image.stem, state, split, image, viewmat, K=K, fov=fov, K_source=camera_file, depth=depth)

@@ -126,7 +126,8 @@ def object_box(views: Sequence[View], cells: int = 48) -> Tensor:
             if len(box) == 0:
                 name = ("start", "end")[state]
                 raise UserError(
-                    f"the masks of state '{name}' show no common object in space; cameras and masks do not belong together"
+                    f"the masks of state '{name}' show no common object in space; cameras and masks do not belong "
+                    "together"
                 )
         corners.append(box)
     lo = np.min([c[0] for c in corners], axis=0)

@@ -85,5 +85,6 @@ def _check_ground_truth(root: Path, format: str, source: Optional[str], report: 
     for state, meshes in enumerate((truth.start, truth.end)):
         if not (meshes.whole and meshes.static and meshes.dynamic):
             report.note(
-                f"{truth.folder / STATES[state]}: lacks the mesh of the whole, the static or a moving part, shape cannot be scored"
+                f"{truth.folder / STATES[state]}: lacks the mesh of the whole, the static or a moving part, shape "
+                "cannot be scored"
             )

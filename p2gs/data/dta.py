@@ -103,7 +103,8 @@ def index(root: Path, report: Report) -> list[Frame]:
     unposed = sorted(p.stem for p in (root / "color_segmented").glob("*.png") if p.stem not in known)
     if unposed:
         report.note(
-            f"{root / 'init_keyframes.yml'}: {len(unposed)} images have no frame and are left out, the first is {unposed[0]}.png"
+            f"{root / 'init_keyframes.yml'}: {len(unposed)} images have no frame and are left out, the first is "
+            f"{unposed[0]}.png"
         )
     check_frames(frames, root, report)
     return frames

@@ -70,7 +70,8 @@ def parse_joint(entry: dict, where: str) -> Joint:
         raise UserError(f"{where} holds numbers that are not finite, expected an axis o and d and a range l and r")
     if kind not in ("rotate", "translate") or not axis.norm() > 0:
         raise UserError(
-            f"{where} needs the type rotate or translate and an axis of some length, but has {short(kind)} and {axis.tolist()}"
+            f"{where} needs the type rotate or translate and an axis of some length, but has {short(kind)} and "
+            f"{axis.tolist()}"
         )
     axis = axis / axis.norm()
     if kind == "rotate":

@@ -154,7 +154,8 @@ def _read_alpha(frame: Frame, image: np.ndarray, report: Report) -> Optional[np.
         mask = mask if mask.ndim == 2 else mask[..., min(2, mask.shape[2] - 1)]
         if mask.shape != image.shape[:2]:
             report.error(
-                f"{frame.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, but its image is {image.shape[1]}x{image.shape[0]}"
+                f"{frame.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, but its image is "
+                f"{image.shape[1]}x{image.shape[0]}"
             )
             return None
         alpha = coverage(mask)
@@ -194,7 +195,8 @@ def _check_fit(K: np.ndarray, frame: Frame, width: int, height: int, report: Rep
     low, high = FOCAL_RANGE
     if not (low < K[0, 0] < high and low < K[1, 1] < high):
         report.error(
-            f"{frame.K_source}: focal length of {K[0, 0]:g} x {K[1, 1]:g} pixels for {frame.image.name} is none of a photograph"
+            f"{frame.K_source}: focal length of {K[0, 0]:g} x {K[1, 1]:g} pixels for {frame.image.name} is none of a "
+            "photograph"
         )
         return False
     cx, cy = K[0, 2], K[1, 2]

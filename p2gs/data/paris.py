@@ -111,7 +111,8 @@ def index(root: Path, report: Report, source: Optional[str] = None) -> list[Fram
             unposed = sorted(p.stem for p in folder.glob("*.png") if p.stem not in cameras) if folder.is_dir() else []
             if unposed:
                 report.note(
-                    f"{camera_file}: {len(unposed)} images have no camera frame and are left out, the first is {unposed[0]}.png"
+                    f"{camera_file}: {len(unposed)} images have no camera frame and are left out, the first is "
+                    f"{unposed[0]}.png"
                 )
     check_frames(frames, root, report)
     return frames

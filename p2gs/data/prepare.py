@@ -87,7 +87,8 @@ def check_truth(found: Prepared) -> None:
         return
     if truth is None:
         found.problems.append(
-            "there is no ground truth (gt/trans.json, or data/<source>/textured_objs/trans.json), so results cannot be scored"
+            "there is no ground truth (gt/trans.json, or data/<source>/textured_objs/trans.json), so results cannot "
+            "be scored"
         )
         return
     kinds = [j.type for j in truth.joints]

@@ -51,8 +51,9 @@ def write_diagnostics(
 ) -> dict:
     """Both files; returns what the JSON holds.
 
-    diagnosis: of ``diagnosis.measures.diagnose``.  strips: (stage, text, picture).  diagonal: of the object's box, input
-    units. Losses at the start and end of each training stage come from RUN/logs (left out where nothing was logged).
+    diagnosis: of ``diagnosis.measures.diagnose``.  strips: (stage, text, picture).  diagonal: of the object's box,
+    input units. Losses at the start and end of each training stage come from RUN/logs (left out where nothing was
+    logged).
     """
     run_dir = Path(run_dir)
     said = verdicts(diagnosis, diagonal)
@@ -217,7 +218,10 @@ def _fusion(d: dict) -> list[str]:
     if any(f.get("owners") or []):
         text += f"; {sum(f['owners']):,} went to the part that hides them in the other state"
     for state, o in zip(("start", "end"), f.get("openings") or [], strict=False):
-        text += f"; {state}: {o['unconfirmed']:,} that the other state says nothing of, {o['removed']:,} gave way to the walls behind"
+        text += (
+            f"; {state}: {o['unconfirmed']:,} that the other state says nothing of, {o['removed']:,} gave way to "
+            "the walls behind"
+        )
         text += f" and {o['boards']} boards before these" if o.get("boards") else ""
     return [
         table(["part of discovery", "Gaussians", "with a partner in the other state"], rows),

@@ -71,12 +71,14 @@ def diagnostic_strips(
         ),
         "evidence": (
             "discovery",
-            "Red: seen through by the other state's cameras, so it moved; blue: still there; yellow: hidden, says nothing. Parts are what "
+            "Red: seen through by the other state's cameras, so it moved; blue: still there; yellow: hidden, says "
+            "nothing. Parts are what "
             "the last stage carried to this state; magenta: labels left out of the polish.",
         ),
         "moved": (
             "finish",
-            "Each state's Gaussians carried into the other state by the joints found. A wrong joint or label is a bright region.",
+            "Each state's Gaussians carried into the other state by the joints found. A wrong joint or label is a "
+            "bright region.",
         ),
         "twin": ("articulation", "The twin as it was learned and polished, posed in both states."),
     }

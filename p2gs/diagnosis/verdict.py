@@ -115,7 +115,8 @@ def _discovery(d: dict, say) -> None:
         if loose > limit("moved_without_part"):
             say(
                 "discovery",
-                f"{loose:.0%} of what moved in the {name} state belongs to no part: a part is missing, or a motion is wrong.",
+                f"{loose:.0%} of what moved in the {name} state belongs to no part: a part is missing, or a motion "
+                "is wrong.",
             )
     if not found["parts"]:
         say("discovery", "No motion explains what moved: no moving part was found.")
@@ -123,7 +124,10 @@ def _discovery(d: dict, say) -> None:
         ranks = [e["rank"] for e in found["explanations"]]
         gap = min(r for i, r in enumerate(ranks) if i != found["chosen"]) - ranks[found["chosen"]]
         if gap < limit("close_call"):
-            text = f"Two explanations fit almost alike (energies {gap:.3f} apart): other parts are possible (try another seed)."
+            text = (
+                f"Two explanations fit almost alike (energies {gap:.3f} apart): other parts are possible (try "
+                "another seed)."
+            )
             say("discovery", text, "note")
     chosen = found["explanations"][found["chosen"]] if found["chosen"] is not None else {}
     for r in chosen.get("reductions", []):
@@ -147,11 +151,17 @@ def _static(d: dict, say) -> None:
             continue
         known = (d["motion_evidence"] or {}).get(name, {}).get("moved_without_part")
         if known is None or known <= limit("moved_without_part"):  # else discovery has said so
-            text = f"{s['moved_static']:.0%} of what moved in the {name} state is called static in the twin: a part is missing."
+            text = (
+                f"{s['moved_static']:.0%} of what moved in the {name} state is called static in the twin: a part "
+                "is missing."
+            )
             say("discovery" if known is None else "articulation", text)
     wrong = min(r["bright_static"] for r in d["residuals"].values())
     if wrong > limit("bright_static"):
-        text = f"{wrong:.0%} of the object is wrong both ways where nothing is said to move: a moving piece was left with the base."
+        text = (
+            f"{wrong:.0%} of the object is wrong both ways where nothing is said to move: a moving piece was left "
+            "with the base."
+        )
         say("discovery", text)
 
 
@@ -207,7 +217,10 @@ def _joints(d: dict, say, diagonal: float) -> None:
             text = f"{name} ({j['type']}): {why}; its motion is not reliable (confidence {j['confidence']:.2f})"
             earlier = j["confidence_by_stage"]
             if "discovery" in earlier:
-                text += f"; discovery handed it over with {earlier['discovery']:.2f}, articulation with {earlier['articulation']:.2f}"
+                text += (
+                    f"; discovery handed it over with {earlier['discovery']:.2f}, articulation with "
+                    f"{earlier['articulation']:.2f}"
+                )
             say(next(s for s, c in earlier.items() if c < limit("confidence")), text + ".")
         elif reasons:
             say("finish", f"{name} ({j['type']}): {why} (confidence {j['confidence']:.2f}).", "note")

@@ -203,4 +203,7 @@ def open_note(asset: Asset) -> Optional[str]:
     names = [link.name for link in asset.links if not link.closed]
     if not names:
         return None
-    return f"the mesh of {', '.join(names)} is open where no photograph looked: mass and inertia go by the collision pieces, not by volume"
+    return (
+        f"the mesh of {', '.join(names)} is open where no photograph looked: mass and inertia go by the collision "
+        "pieces, not by volume"
+    )

@@ -136,7 +136,8 @@ def own_folder(run_dir: Path | str, out: Optional[Path | str], option: str) -> P
     part_1."""
     if out is None or Path(out).resolve() == Path(run_dir).resolve():
         raise UserError(
-            f"{option}: {run_dir} keeps the names base and part_1 that other programs read; give another folder with --out"
+            f"{option}: {run_dir} keeps the names base and part_1 that other programs read; give another folder with "
+            "--out"
         )
     return Path(out)
 
@@ -167,7 +168,8 @@ def export_run(
     chosen = ExportOptions(**options)
     if chosen.texture and UNTEXTURED.issuperset(kinds):
         raise UserError(
-            f"--texture: {', '.join(kinds)} holds vertex colours and no textures; name another format as well, or leave it out"
+            f"--texture: {', '.join(kinds)} holds vertex colours and no textures; name another format as well, or "
+            "leave it out"
         )
     if chosen.names is not None:
         out = own_folder(run_dir, out, "--name")

@@ -44,6 +44,7 @@ def read_meta(path: Path | str) -> dict[str, Scalar]:
         out[key] = value
     if "qcode" in out and not QCODE.fullmatch(str(out["qcode"])):
         raise UserError(
-            f"--meta: {path}: qcode is '{out['qcode']}', expected Wikidata's identifier of the kind of object, such as Q42177"
+            f"--meta: {path}: qcode is '{out['qcode']}', expected Wikidata's identifier of the kind of object, such "
+            "as Q42177"
         )
     return out

@@ -38,4 +38,7 @@ def unlikely_size(longest: float, told: str = "") -> Optional[str]:
     if low <= longest <= high:
         return None
     usual = f" (a {name}: {low:g} to {high:g})" if name else ""
-    return f"the object's longest side comes out as {longest:.3g} m{usual}: give metres per unit of the input with --scale, or its --height"
+    return (
+        f"the object's longest side comes out as {longest:.3g} m{usual}: give metres per unit of the input with "
+        "--scale, or its --height"
+    )

@@ -59,7 +59,8 @@ def read_twin_json(path: Path | str) -> tuple[list[Part], float]:
             raise ValueError(f"{len(parts)} parts, canonical_time {time:g}")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, RuntimeError, AttributeError) as err:
         raise UserError(
-            f"{path}: part {len(parts)} cannot be read ({type(err).__name__}: {short(str(err))}); expected a canonical_time in 0..1, "
+            f"{path}: part {len(parts)} cannot be read ({type(err).__name__}: {short(str(err))}); expected a "
+            "canonical_time in 0..1, "
             "the static part 0 and movable ones with a joint (type, axis, origin, motion, limits, transform)"
         ) from err
     return parts, time
@@ -76,7 +77,8 @@ def load_twin(run_dir: Path | str) -> ArticulatedObject:
         raise UserError(f"{run_dir / CANONICAL} has no part_id column, so its Gaussians belong to no part")
     if len(gaussians) == 0 or int(part_ids.min()) < 0 or int(part_ids.max()) >= len(parts):
         raise UserError(
-            f"{run_dir / CANONICAL} does not fit twin.json: its part_id leave 0..{len(parts) - 1}, or it holds no Gaussian"
+            f"{run_dir / CANONICAL} does not fit twin.json: its part_id leave 0..{len(parts) - 1}, or it holds no "
+            "Gaussian"
         )
     return ArticulatedObject(gaussians, part_ids, parts, canonical_time)
 

@@ -93,7 +93,8 @@ def check_losses(config: ArticulationConfig, losses: dict[str, Loss], canonical:
         )
     if config.repel.render and "art" not in losses:
         raise UserError(
-            "phases.articulation.repel.render: draws the force of losses.art, which is switched off; expected render: false"
+            "phases.articulation.repel.render: draws the force of losses.art, which is switched off; expected "
+            "render: false"
         )
 
 
@@ -115,7 +116,8 @@ class ArticulationPhase(ImagePhase):
     def build(cls, run: RunContext, section, *, states, canonical, sharpened=None, motions=None) -> "ArticulationPhase":
         if motions is None and section.config.init == "discovery":
             raise UserError(
-                "phases.articulation.init: discovery needs 'motions', which no stage hands over; add discovery to stages, "
+                "phases.articulation.init: discovery needs 'motions', which no stage hands over; add discovery to "
+                "stages, "
                 "or give --num_parts N and init: random or identity"
             )
         parts = len(motions) + 1 if motions is not None and not run.exact else run.num_parts
@@ -178,7 +180,8 @@ class ArticulationPhase(ImagePhase):
 
     #
     #
-    # -- parameters -----------------------------------------------------------------------------------------------------------
+    #
+    # -- parameters ---------------------------------------------------------------------------------------------------
     def parameter_groups(self):
         rates = self.config.rates.at(0.0)
         groups = {name: ([getattr(self.splats, name)], rates[name]) for name in rates}
@@ -202,7 +205,8 @@ class ArticulationPhase(ImagePhase):
 
     #
     #
-    # -- one step -------------------------------------------------------------------------------------------------------------
+    #
+    # -- one step -----------------------------------------------------------------------------------------------------
     def inputs(self, visit: Visit) -> LossInputs:
         step, state = visit.step, visit.state
         camera, target = self.target(visit)
@@ -301,7 +305,8 @@ class ArticulationPhase(ImagePhase):
 
     #
     #
-    # -- results --------------------------------------------------------------------------------------------------------------
+    #
+    # -- results ------------------------------------------------------------------------------------------------------
     @torch.no_grad()
     def hand_over(self) -> Articulation:
         """Argmax labels; parts with a canonical time of their own are carried to the common one."""

@@ -28,7 +28,8 @@ def check_loss(stage: str, step: int, scalars: dict[str, Tensor | float]) -> Non
     which = ", ".join(f"{name} is {value}" for name, value in wrong.items()) or "the terms are finite, their sum is not"
     option = f"phases.{section_of_stage(stage)}.losses.{next(iter(wrong), 'NAME')}"
     raise LossNotFinite(
-        f"{stage}: the loss is not finite at step {step} ({which}); the stage stopped with the state before that step, which "
+        f"{stage}: the loss is not finite at step {step} ({which}); the stage stopped with the state before that "
+        "step, which "
         f"checkpoints/{stage}.ckpt keeps where checkpoints are on; lower the learning rates or that loss's weight, "
         f"or leave it out ({option})"
     )
@@ -39,7 +40,8 @@ def check_gaussians(stage: str, count: int, before: int | None = None) -> None:
     if count == 0:
         were = "" if not before else f" of {before}, no training view sees any"
         raise UserError(
-            f"{stage}: the reconstruction has collapsed, no Gaussian is left{were}; expected an object: look at the masks "
+            f"{stage}: the reconstruction has collapsed, no Gaussian is left{were}; expected an object: look at the "
+            "masks "
             "(p2gs data check) and at callbacks.densify (min_opacity, max_scale), or train with lower learning rates"
         )
 

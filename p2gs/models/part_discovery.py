@@ -58,7 +58,8 @@ def find_part_motions(
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
     for part in unfounded:
         say(
-            f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence {part['confidence']:.2f})"
+            f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence "
+            f"{part['confidence']:.2f})"
         )
     motions.diagnostics = {
         "first_looks": looks,
@@ -86,7 +87,8 @@ def _evidence(
         if len(out[-1].points) < 10 or not any(bool((d > 0).any()) for d in out[-1].depths):
             name = ("start", "end")[s.state]
             raise UserError(
-                f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state longer)"
+                f"discovery: the {name} reconstruction shows nothing opaque; expected an object (train single_state "
+                "longer)"
             )
     return out
 

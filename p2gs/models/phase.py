@@ -62,7 +62,8 @@ class Phase(LightningModule, Stage):
 
     #
     #
-    # -- what a subclass gives ------------------------------------------------------------------------------------------------
+    #
+    # -- what a subclass gives ----------------------------------------------------------------------------------------
     def parameter_groups(self) -> dict[str, tuple[list[Tensor], float]]:
         """name -> (parameters, learning rate at step 0)."""
         raise NotImplementedError
@@ -89,7 +90,8 @@ class Phase(LightningModule, Stage):
 
     #
     #
-    # -- what all share -------------------------------------------------------------------------------------------------------
+    #
+    # -- what all share -----------------------------------------------------------------------------------------------
     @property
     def step(self) -> int:
         """Optimiser steps done."""
@@ -131,7 +133,8 @@ class Phase(LightningModule, Stage):
         if total is None or not total.requires_grad:
             on = ", ".join(self.losses) or "none"
             raise UserError(
-                f"phases.{self.phase_name}.losses: no loss applies at step {inputs.step} (switched on: {on}); expected at least 'render'"
+                f"phases.{self.phase_name}.losses: no loss applies at step {inputs.step} (switched on: {on}); "
+                "expected at least 'render'"
             )
         self.scalars["loss/total"] = total.detach()
         return total

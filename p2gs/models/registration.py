@@ -98,15 +98,24 @@ def align_states(
     apply_gain = config.gain == "auto" and dimmer.passed(config.least)
     angle = float(torch.rad2deg(so3.rotation_angle(T[:3, :3])))
     figures = {
-        "share": found.share, "spread": found.spread / diagonal, "rms": found.rms / diagonal, "shift": shift, "angle": angle,
+        "share": found.share,
+        "spread": found.spread / diagonal,
+        "rms": found.rms / diagonal,
+        "shift": shift,
+        "angle": angle,
         "log_gain": gain.tolist(),
-        "motion": {"applied": apply_motion, **vars(moved)}, "gain": {"applied": apply_gain, **vars(dimmer)},
-    }  # fmt: skip
-    beside = f"{100 * shift:.3f} % of the object and {angle:.3f} degrees beside the start, by {100 * found.share:.0f} % of its surface"
+        "motion": {"applied": apply_motion, **vars(moved)},
+        "gain": {"applied": apply_gain, **vars(dimmer)},
+    }
+    beside = (
+        f"{100 * shift:.3f} % of the object and {angle:.3f} degrees beside the start, by "
+        f"{100 * found.share:.0f} % of its surface"
+    )
     say(f"the end lies {beside}; {moved.told()}: {'applied' if apply_motion else 'not applied'}")
     factors = ", ".join(f"{g:.3f}" for g in gain.exp().tolist())
     say(
-        f"the end's red, green and blue are {factors} times the start's; {dimmer.told()}: {'applied' if apply_gain else 'not applied'}"
+        f"the end's red, green and blue are {factors} times the start's; {dimmer.told()}: "
+        f"{'applied' if apply_gain else 'not applied'}"
     )
     return Registration(best, gain if apply_gain else dark, figures)
 

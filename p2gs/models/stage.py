@@ -46,8 +46,8 @@ class Stage:
 
     @classmethod
     def compute(cls, run: RunContext, section: Any, **given: Any) -> Any:
-        """The result of a phase that does not train: a dataclass of ``gaussians.handover``, or plain values. Arguments as
-        of ``build``."""
+        """The result of a phase that does not train: a dataclass of ``gaussians.handover``, or plain values. Arguments
+        as of ``build``."""
         raise NotImplementedError(f"{cls.__name__} does not train and has to define compute()")
 
     @classmethod

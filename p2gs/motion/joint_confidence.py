@@ -154,9 +154,19 @@ class CrossViews:
     """
 
     def __init__(
-        self, state: StateGaussians, labels: Tensor, transforms: Tensor, views: TrainingViews, *, level: int, looks: int = 16,
-        count: int = 5, min_opacity: float = 0.05, backend: str = "auto", device="cpu",
-    ):  # fmt: skip
+        self,
+        state: StateGaussians,
+        labels: Tensor,
+        transforms: Tensor,
+        views: TrainingViews,
+        *,
+        level: int,
+        looks: int = 16,
+        count: int = 5,
+        min_opacity: float = 0.05,
+        backend: str = "auto",
+        device="cpu",
+    ):
         solid = torch.sigmoid(state.gaussians.opacity_logits) > min_opacity
         self.body = MovedGaussians(state.gaussians, torch.where(solid, labels, -1), device)
         self.transforms, self.backend = transforms.double(), backend
@@ -221,10 +231,20 @@ class CrossViews:
 
 @torch.no_grad()
 def measure_joints(
-    states: list[StateGaussians], labels: list[Tensor], transforms: Tensor, types: list[str], views: dict[int, TrainingViews],
-    stacks: list[DepthStack], *, level: int, both: list[Tensor] | None = None, looks: int = 16, count: int = 5, backend: str = "auto",
+    states: list[StateGaussians],
+    labels: list[Tensor],
+    transforms: Tensor,
+    types: list[str],
+    views: dict[int, TrainingViews],
+    stacks: list[DepthStack],
+    *,
+    level: int,
+    both: list[Tensor] | None = None,
+    looks: int = 16,
+    count: int = 5,
+    backend: str = "auto",
     device="cpu",
-) -> list[JointEvidence]:  # fmt: skip
+) -> list[JointEvidence]:
     """The evidence for every joint.
 
     labels: part ids of each state's Gaussians.  transforms [K-1, 4, 4] start -> end.  views: photographs by state.

@@ -96,9 +96,17 @@ def single_ways(
 
 
 def explanation_cost(
-    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], *, backend: str, level: int | None = None,
-    seen: list[Seen] | None = None, device="cpu",
-) -> float:  # fmt: skip
+    states,
+    motions: PartMotions,
+    views,
+    config: PolishConfig,
+    stacks: list[DepthStack],
+    *,
+    backend: str,
+    level: int | None = None,
+    seen: list[Seen] | None = None,
+    device="cpu",
+) -> float:
     """Image loss of each state's Gaussians moved into the other state's photographs, both directions averaged.
 
     Of the Gaussians those that nothing contradicts are drawn (``kept_and_shown``); pixels of surface that the other

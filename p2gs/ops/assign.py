@@ -19,7 +19,8 @@ def soft_assignment(psi: Tensor, weight: Tensor, bias: Tensor, temperature: floa
     parts, dim = weight.shape
     if psi.ndim != 2 or psi.shape[1] != dim or bias.shape != (parts,):
         raise ValueError(
-            f"soft_assignment wants psi [N, D], weight [K, D], bias [K], got {tuple(psi.shape)}, {tuple(weight.shape)}, {tuple(bias.shape)}"
+            f"soft_assignment wants psi [N, D], weight [K, D], bias [K], got {tuple(psi.shape)}, "
+            f"{tuple(weight.shape)}, {tuple(bias.shape)}"
         )
     inputs = (psi, weight, bias)
     fits = native is not None and 1 <= parts <= native.assign_parts and 1 <= dim <= native.assign_dim

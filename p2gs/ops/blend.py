@@ -23,7 +23,8 @@ def blend_move(means: Tensor, quats: Tensor, probs: Tensor, twists: Tensor) -> t
     n, parts = probs.shape
     if means.shape != (n, 3) or quats.shape != (n, 4) or twists.shape != (parts - 1, 6):
         raise ValueError(
-            f"blend_move wants means [N, 3], quats [N, 4], probs [N, K], twists [K-1, 6], got {tuple(means.shape)}, {tuple(quats.shape)}, "
+            f"blend_move wants means [N, 3], quats [N, 4], probs [N, K], twists [K-1, 6], got {tuple(means.shape)}, "
+            f"{tuple(quats.shape)}, "
             f"{tuple(probs.shape)}, {tuple(twists.shape)}"
         )
     inputs = (means, quats, probs, twists)

@@ -38,7 +38,8 @@ def carry(means: Tensor, quats: Tensor, sh: Tensor, parts: Parts, transforms: Te
     n = len(parts.labels)
     if means.shape != (n, 3) or quats.shape != (n, 4) or sh.shape[::2] != (n, 3) or transforms.shape[1:] != (4, 4):
         raise ValueError(
-            f"carry wants means [N, 3], quats [N, 4], sh [N, B, 3], transforms [K-1, 4, 4] for N = {n}, got {tuple(means.shape)}, "
+            f"carry wants means [N, 3], quats [N, 4], sh [N, B, 3], transforms [K-1, 4, 4] for N = {n}, got "
+            f"{tuple(means.shape)}, "
             f"{tuple(quats.shape)}, {tuple(sh.shape)}, {tuple(transforms.shape)}"
         )
     if parts.count > len(transforms):

@@ -13,20 +13,22 @@ class PartMotionsConfig:
     """Options of part discovery.
 
     evidence_size: long edge of the rendered depth maps, pixels.  min_opacity: fainter Gaussians are no surface points.
-    candidates: how many complete explanations, and later changes of one kind, are compared by re-rendering; of more explanations those that
-    look best at a glance, after ``look_steps`` of refinement at the smallest size.
+    candidates: how many complete explanations, and later changes of one kind, are compared by re-rendering; of more
+    explanations those that look best at a glance, after ``look_steps`` of refinement at the smallest size.
     coarse: photometric refinement right after discovery.
-    compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images decide;
-    freedom_penalty: relative image loss by which a turn must win against a slide.
+    compare_types_below: a part that turns by less than this (degrees) is refined as a slide as well, and the images
+    decide; freedom_penalty: relative image loss by which a turn must win against a slide.
     same_motion: two touching parts whose motions carry them this near to each other (internal units) are tried as one.
     survey: shifts within its own surface tried for each part (internal units; [] = none).
-    part_penalty: share of the image loss that each part must save, or goes, and that one which is added or halved must save when parts are
-    reconsidered. On ten objects junk saved at most 1.6 %, true parts 6 % and more, the second of two stacked doors 3 %.
-    islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose surface they touch
-    (0 = off).  rounds: how often labels, types and motions are settled anew.
-    reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched again amid the others,
-    refined, and taken where the energy falls.
-    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to nothing of it.
+    part_penalty: share of the image loss that each part must save, or goes, and that one which is added or halved must
+    save when parts are reconsidered. On ten objects junk saved at most 1.6 %, true parts 6 % and more, the second of
+    two stacked doors 3 %.
+    islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
+    surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.
+    reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched
+    again amid the others, refined, and taken where the energy falls.
+    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to
+    nothing of it.
     """
 
     evidence_size: int = 200

@@ -35,7 +35,8 @@ def merge_to(motions: PartMotions, states: list[StateGaussians], parts: int) -> 
         (a, b), (cost, kind, T) = min(fits.items(), key=lambda item: item[1][0])
         count = len(points[a][0]) + len(points[b][0])
         notes.append(
-            f"exact_parts: parts {a + 1} and {b + 1} became one {kind} part; its points are {(cost / count) ** 0.5:.4f} off (rms)"
+            f"exact_parts: parts {a + 1} and {b + 1} became one {kind} part; its points are "
+            f"{(cost / count) ** 0.5:.4f} off (rms)"
         )
         motions = _merged(motions, a, b, kind, T)
     return motions, notes

@@ -155,9 +155,15 @@ def rasterize_stored(
     name, pixels = split_backend(backend)
     name = _auto(means) if name == "auto" else name
     options = {
-        "depth_sq": False, "depth_ref": 0.0, "near": 0.01, "eps2d": pixels.eps2d, "antialias": pixels.antialias, "absgrad": False,
-        "median_depth": None, **options,
-    }  # fmt: skip
+        "depth_sq": False,
+        "depth_ref": 0.0,
+        "near": 0.01,
+        "eps2d": pixels.eps2d,
+        "antialias": pixels.antialias,
+        "absgrad": False,
+        "median_depth": None,
+        **options,
+    }
     if name != "cpu":
         sh = sh if sh_rest is None else torch.cat([sh, sh_rest], 1)
         activated = (means, quats, log_scales.exp(), torch.sigmoid(opacity_logits), sh)

@@ -42,9 +42,24 @@ def _forward(a: RenderInputs, keep: bool, means, quats, scales, opacities, sh, f
     bases = sh.shape[1] + (0 if sh_rest is None else sh_rest.shape[1])
     image = background is not None and background.dim() == 3
     view.forward(
-        [_address(t) for t in (*inputs, *outputs, sh_rest)], n, bases, a.sh_degree, channels, a.viewmat.reshape(-1).tolist(),
-        [fx, fy, cx, cy], w, h, a.near, a.eps2d, a.depth_ref, a.antialias, image, a.stored, keep, num_threads(),
-    )  # fmt: skip
+        [_address(t) for t in (*inputs, *outputs, sh_rest)],
+        n,
+        bases,
+        a.sh_degree,
+        channels,
+        a.viewmat.reshape(-1).tolist(),
+        [fx, fy, cx, cy],
+        w,
+        h,
+        a.near,
+        a.eps2d,
+        a.depth_ref,
+        a.antialias,
+        image,
+        a.stored,
+        keep,
+        num_threads(),
+    )
     return view, (colour, alpha, depth, depth_sq, features_out, median, radii)
 
 

@@ -41,7 +41,8 @@ def camera_pairs(scene: Path, truth: Path) -> dict[str, tuple[np.ndarray, np.nda
         for frame in _json(scene / f"transforms_train_{state}.json")["frames"]:
             key = f"{state}/{Path(source[frame['file_path']]['source']).stem}"
             if key in true:
-                own.append(frame["transform_matrix"]), other.append(true[key])
+                own.append(frame["transform_matrix"])
+                other.append(true[key])
         if len(own) < 3:
             raise UserError(
                 f"{truth / 'cameras.json'}: knows {len(own)} photographs of state '{state}', expected at least 3"

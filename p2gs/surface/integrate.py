@@ -32,7 +32,8 @@ def integrate(
         maps = (view.depth, view.labels, view.normal_dot, view.cosine, view.colour)
         if any(m is None for m in maps) or any(m.shape[:2] != shape for m in maps):
             raise ValueError(
-                f"a view of {shape[1]} x {shape[0]} pixels wants depth, labels, normal_dot, cosine and colour of that size"
+                f"a view of {shape[1]} x {shape[0]} pixels wants depth, labels, normal_dot, cosine and colour of "
+                "that size"
             )
     if native is None:
         return integrate_reference(points, views, matrices, part, trunc, behind)

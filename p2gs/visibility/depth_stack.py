@@ -115,9 +115,18 @@ class DepthStack:
         """What a kernel over depth maps makes of points [N, 3]: [3, N]."""
         views, points, out = views.contiguous(), points.contiguous(), torch.empty(3, len(points))
         kernel(
-            self.near.data_ptr(), self.far.data_ptr(), self.rows.data_ptr(), *self.depth.shape[1:], views.data_ptr(), len(views), tau,
-            points.data_ptr(), len(points), out.data_ptr(), num_threads(),
-        )  # fmt: skip
+            self.near.data_ptr(),
+            self.far.data_ptr(),
+            self.rows.data_ptr(),
+            *self.depth.shape[1:],
+            views.data_ptr(),
+            len(views),
+            tau,
+            points.data_ptr(),
+            len(points),
+            out.data_ptr(),
+            num_threads(),
+        )
         return out
 
     def counts_reference(

@@ -40,7 +40,8 @@ TINY = [
     ),
     *(
         "--callbacks",
-        "{checkpoint: null, scalars: null, images: null, previews: null, evaluation: null, families: null, progress: null}",
+        "{checkpoint: null, scalars: null, images: null, previews: null, evaluation: null, families: null, progress: "
+        "null}",
     ),
 ]
 

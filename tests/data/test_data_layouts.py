@@ -59,10 +59,12 @@ def test_max_views_spreads_over_the_cameras(written):
     assert [len(scene.select(s, "train")) for s in (0, 1)] == [3, 3] and len(scene.select(split="test")) == 4
     everything = read("artgs", written["artgs"])
     for state in (0, 1):
-        nearest = lambda views: (
-            torch.cdist(*[torch.stack([v.camera.position for v in views])] * 2).fill_diagonal_(9).min()
-        )  # noqa: E731
         assert nearest(scene.select(state, "train")) > 1.2 * nearest(everything.select(state, "train"))
+
+
+def nearest(views):
+    """The least distance between two cameras."""
+    return torch.cdist(*[torch.stack([v.camera.position for v in views])] * 2).fill_diagonal_(9).min()
 
 
 def test_paris_source_paths(written, tmp_path):

@@ -40,7 +40,8 @@ def match(found, obj):
             and np.abs(m.transform.numpy() - G).max() < (0.15 if m.type == "revolute" else 0.05)
         ]
         assert right, (
-            f"{part.joint.type} {part.joint.motion:.2f} is missing among {[(m.type, round(m.amount, 2)) for m in found.motions]}"
+            f"{part.joint.type} {part.joint.motion:.2f} is missing among "
+            f"{[(m.type, round(m.amount, 2)) for m in found.motions]}"
         )
         axis, position, amount = joint_errors(found.motions[right[0]], part.joint, G)
         assert axis < 2 and position < 0.03, (axis, position)

@@ -147,7 +147,8 @@ WATCH = """<script>(function () {  // posts both canvases once the splats are th
     window.last = shots[1];
     if (!still) return;
     before = shots[1];
-    fetch("/", { method: "POST", body: JSON.stringify({ shots, loaded: performance.getEntriesByType("resource").map((r) => r.name) }) });
+    const loaded = performance.getEntriesByType("resource").map((r) => r.name);
+    fetch("/", { method: "POST", body: JSON.stringify({ shots, loaded }) });
     if (moved) return;
     moved = true;
     const slider = document.querySelector("input[data-part='1']");

@@ -33,23 +33,77 @@ ODD_NUMBERS = (
     -float("inf"),
 )
 ODD_TEXTS = (
-    "", " ", ".", "..", "/", "x", "null", "nan", "1e999", "../../../../etc/hostname", "/etc/hostname", "~/x", "a" * 300,
-    "a/" * 3000, "b" * 50_000, "\0", "a\0b", "\ud800", "\u202e", "<script>alert(1)</script>", "%s%n", "{}", "C:\\x", "-1",
-    "--help", "é" * 200,
-)  # fmt: skip
+    "",
+    " ",
+    ".",
+    "..",
+    "/",
+    "x",
+    "null",
+    "nan",
+    "1e999",
+    "../../../../etc/hostname",
+    "/etc/hostname",
+    "~/x",
+    "a" * 300,
+    "a/" * 3000,
+    "b" * 50_000,
+    "\0",
+    "a\0b",
+    "\ud800",
+    "\u202e",
+    "<script>alert(1)</script>",
+    "%s%n",
+    "{}",
+    "C:\\x",
+    "-1",
+    "--help",
+    "é" * 200,
+)
 ODD_YAML = (
-    "!!python/object/apply:os.system ['true']", "!!python/name:os.system", "2001-99-99", "0o9", "190:99:99", "!!map x", "!!set {a, b}",
-    "&a [*a]", "? [a]\n: b", "<<: 5", "*nothing", "%TAG ! x", "!!binary '%'", "!!int x", "!!float .", "[" * 2000, "{a: " * 300,
-    "a: b: c", "- - - -\n  :", "\t",
+    "!!python/object/apply:os.system ['true']",
+    "!!python/name:os.system",
+    "2001-99-99",
+    "0o9",
+    "190:99:99",
+    "!!map x",
+    "!!set {a, b}",
+    "&a [*a]",
+    "? [a]\n: b",
+    "<<: 5",
+    "*nothing",
+    "%TAG ! x",
+    "!!binary '%'",
+    "!!int x",
+    "!!float .",
+    "[" * 2000,
+    "{a: " * 300,
+    "a: b: c",
+    "- - - -\n  :",
+    "\t",
     "a: &a [x, x, x, x, x, x, x, x]\nb: &b [*a, *a, *a, *a, *a, *a, *a, *a]\nc: &c [*b, *b, *b, *b, *b, *b, *b, *b]\n"
-    "d: &d [*c, *c, *c, *c, *c, *c, *c, *c]\ne: &e [*d, *d, *d, *d, *d, *d, *d, *d]\nf: &f [*e, *e, *e, *e, *e, *e, *e, *e]\n"
-    "g: &g [*f, *f, *f, *f, *f, *f, *f, *f]\nh: &h [*g, *g, *g, *g, *g, *g, *g, *g]\nphases: *h\nframe_0_0: {cam_in_ob: *h}",
-)  # fmt: skip
+    "d: &d [*c, *c, *c, *c, *c, *c, *c, *c]\ne: &e [*d, *d, *d, *d, *d, *d, *d, *d]\nf: &f [*e, *e, *e, *e, *e, *e, "
+    "*e, *e]\n"
+    "g: &g [*f, *f, *f, *f, *f, *f, *f, *f]\nh: &h [*g, *g, *g, *g, *g, *g, *g, *g]\nphases: *h\nframe_0_0: "
+    "{cam_in_ob: *h}",
+)
 
 ODD_WORDS = (
-    b"", b"-1", b"0", b"7", b"999999999999", b"9" * 30, b"1e9", b"nan", b"vertex", b"list", b"double", b"uchar", b"\xff",
+    b"",
+    b"-1",
+    b"0",
+    b"7",
+    b"999999999999",
+    b"9" * 30,
+    b"1e9",
+    b"nan",
+    b"vertex",
+    b"list",
+    b"double",
+    b"uchar",
+    b"\xff",
     b"property float x",
-)  # fmt: skip
+)
 
 
 def odd_value(rng: random.Random) -> Any:

@@ -44,7 +44,8 @@ def build(name, **options):
 
 #
 #
-# -- the formulas as loops ----------------------------------------------------------------------------------------------------
+#
+# -- the formulas as loops --------------------------------------------------------------------------------------------
 def kl(p, q):
     return sum(a * math.log(a / b) for a, b in zip(p, q, strict=True))
 
@@ -182,7 +183,8 @@ def test_losses_are_their_formulas(seed):
 
 #
 #
-# -- invariances --------------------------------------------------------------------------------------------------------------
+#
+# -- invariances ------------------------------------------------------------------------------------------------------
 @each_loss
 def test_the_world_frame_does_not_matter(name, options):
     inputs, loss = make_inputs(seed=2), build(name, **options)
@@ -211,7 +213,8 @@ def test_the_sum_grows_with_the_number(name):
 
 #
 #
-# -- gradients ----------------------------------------------------------------------------------------------------------------
+#
+# -- gradients --------------------------------------------------------------------------------------------------------
 @each_loss
 def test_gradients_against_finite_differences(name, options):
     inputs = make_inputs(n=14, seed=5)
@@ -263,7 +266,8 @@ def test_gradients_stay_finite_when_everything_is_certain_and_coincides(name, op
 
 #
 #
-# -- what the terms are for ---------------------------------------------------------------------------------------------------
+#
+# -- what the terms are for -------------------------------------------------------------------------------------------
 def test_a_true_rigid_motion_costs_nothing_but_the_paper_velocity_charges_for_turning():
     inputs = make_inputs(seed=8, sharp=True, noise=0.0)
     for name in ("vector", "velocity"):
@@ -385,7 +389,8 @@ def test_contact_by_the_letter_punishes_containment_and_the_margin_does_not():
 
 #
 #
-# -- switches -----------------------------------------------------------------------------------------------------------------
+#
+# -- switches ---------------------------------------------------------------------------------------------------------
 @each_loss
 def test_missing_inputs_give_none(name, options):
     inputs, loss = make_inputs(), build(name, **options)

@@ -46,9 +46,19 @@ def torchvision(monkeypatch):
         assert (net, pretrained) == ("alexnet", False)  # nothing is downloaded
         relu = lambda: nn.ReLU(inplace=True)  # noqa: E731
         return nn.Sequential(
-            nn.Conv2d(3, 64, 11, 4, 2), relu(), nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, padding=2), relu(), nn.MaxPool2d(3, 2),
-            nn.Conv2d(192, 384, 3, padding=1), relu(), nn.Conv2d(384, 256, 3, padding=1), relu(), nn.Conv2d(256, 256, 3, padding=1), relu(),
-        )  # fmt: skip
+            nn.Conv2d(3, 64, 11, 4, 2),
+            relu(),
+            nn.MaxPool2d(3, 2),
+            nn.Conv2d(64, 192, 5, padding=2),
+            relu(),
+            nn.MaxPool2d(3, 2),
+            nn.Conv2d(192, 384, 3, padding=1),
+            relu(),
+            nn.Conv2d(384, 256, 3, padding=1),
+            relu(),
+            nn.Conv2d(256, 256, 3, padding=1),
+            relu(),
+        )
 
     monkeypatch.setattr(theirs, "_get_tv_model_features", features)
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: object())

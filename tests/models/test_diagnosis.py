@@ -27,13 +27,31 @@ def small_run(found=None, polish_steps=0):
     n = len(labels)
     told = {
         "explanation": 0,
-        "reconsidered": [{"change": "parted", "part": 0, "type": "revolute", "cost": 0.1, "after": 0.0987, "proposed": 0.1, "energy": 0.0213}],
-        "explanations": [{"types": ["revolute"], "cost": 0.1, "rank": 0.1, "reductions": [
-            {"change": "drop", "type": "prismatic", "cost_with": 0.1, "cost_without": 0.1001, "energy": -0.029}]}],
+        "reconsidered": [
+            {
+                "change": "parted",
+                "part": 0,
+                "type": "revolute",
+                "cost": 0.1,
+                "after": 0.0987,
+                "proposed": 0.1,
+                "energy": 0.0213,
+            }
+        ],
+        "explanations": [
+            {
+                "types": ["revolute"],
+                "cost": 0.1,
+                "rank": 0.1,
+                "reductions": [
+                    {"change": "drop", "type": "prismatic", "cost_with": 0.1, "cost_without": 0.1001, "energy": -0.029}
+                ],
+            }
+        ],
         "evidence": [labels.to(torch.int8)] * 2,
         "states": [{"moved": 300, "static": 300, "unknown": 0}] * 2,
         "min_opacity": 0.5,
-    }  # fmt: skip
+    }
     motions = PartMotions(["revolute"], T, torch.ones(1), [labels, labels], [torch.ones(n)] * 2, told)
     g = states[0].gaussians
     zero = torch.zeros(n, 3)

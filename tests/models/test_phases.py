@@ -74,8 +74,17 @@ def fit(phase, folder, until=None, resume=None, densify=True):
     if densify:
         callbacks.insert(0, Densify(budget=260, every=6, start=0.0, stop=0.9))
     steps = phase.total_steps if until is None else until
-    trainer = Trainer(max_steps=steps, max_epochs=-1, accelerator="cpu", logger=False, callbacks=callbacks, default_root_dir=folder,
-                      enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False)  # fmt: skip
+    trainer = Trainer(
+        max_steps=steps,
+        max_epochs=-1,
+        accelerator="cpu",
+        logger=False,
+        callbacks=callbacks,
+        default_root_dir=folder,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=False,
+    )
     trainer.fit(phase, datamodule=TinyData(), ckpt_path=resume, weights_only=True)
     return phase
 

@@ -1,3 +1,4 @@
+import functools
 import math
 
 import pytest
@@ -89,9 +90,8 @@ def test_force_turns_with_the_scene_and_does_not_see_translation():
 def test_gradients(reduce):
     x, r = cloud(4, 7).requires_grad_(), cloud(5, 8).requires_grad_()
     for tau_max in (None, 0.2):
-        assert gradcheck(
-            lambda x, r: repel_force(x, r, k_r=0.1, reduce=reduce, radius=1.5, tau_max=tau_max, eps=0.01), (x, r)
-        )  # noqa: B023
+        options = {"k_r": 0.1, "reduce": reduce, "radius": 1.5, "tau_max": tau_max, "eps": 0.01}
+        assert gradcheck(functools.partial(repel_force, **options), (x, r))
     same = torch.zeros(1, 3, requires_grad=True)
     repel_force(same, same.detach(), reduce=reduce, radius=1.0, tau_max=0.1).sum().backward()
     assert torch.isfinite(same.grad).all()
@@ -126,9 +126,11 @@ def test_points_are_placed_on_the_static_side_of_the_interface():
 
 def test_placement_is_reproducible_and_noise_has_its_size():
     static, movable = cloud(3000, 1).float(), cloud(3000, 2).float()
-    draw = lambda noise: place_repel_points(
-        static, movable, 1500, 0.2, noise=noise, generator=torch.Generator().manual_seed(3)
-    )  # noqa: E731
+
+    def draw(noise):
+        generator = torch.Generator().manual_seed(3)
+        return place_repel_points(static, movable, 1500, 0.2, noise=noise, generator=generator)
+
     assert (draw(0.0) == draw(0.0)).all()
     # a length, not a spread per axis
     torch.testing.assert_close((draw(0.05) - draw(0.0)).norm(dim=1), torch.full((1500,), 0.05))

@@ -19,7 +19,9 @@ REPO = Path(__file__).parents[2]
 STATES = """
 include: [preset/smoke.yaml]
 data: {{format: synthetic, root: {root}, kind: demo, size: 48, train_views: 8, test_views: 1, depth: never}}
-phases: {{single_state: {{steps: 20000, initial_gaussians: 300, levels: [24], level_starts: [0.0], callbacks: {{densify: null}}}}}}
+phases:
+  single_state:
+    {{steps: 20000, initial_gaussians: 300, levels: [24], level_starts: [0.0], callbacks: {{densify: null}}}}
 callbacks: {{checkpoint: {{every: 5}}}}
 """
 

@@ -118,9 +118,15 @@ needs_native = pytest.mark.skipif(native is None, reason="p2gs was installed wit
 @needs_native
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
 @given(
-    n=st.integers(1, 60), width=st.integers(1, 70), height=st.integers(1, 70), features=st.sampled_from([0, 3]),
-    background=st.sampled_from(["none", "constant", "image"]), scale=st.floats(0.005, 1.5), depth_sq=st.booleans(), seed=st.integers(0, 99),
-)  # fmt: skip
+    n=st.integers(1, 60),
+    width=st.integers(1, 70),
+    height=st.integers(1, 70),
+    features=st.sampled_from([0, 3]),
+    background=st.sampled_from(["none", "constant", "image"]),
+    scale=st.floats(0.005, 1.5),
+    depth_sq=st.booleans(),
+    seed=st.integers(0, 99),
+)
 def test_any_size(n, width, height, features, background, scale, depth_sq, seed):
     w = world(
         n, width, height, features=features, background=background, bases=4, scale=(0.3 * scale, scale), seed=seed

@@ -188,7 +188,8 @@ def test_slow_reference_says_so_once():
         "z = torch.zeros\n"
         "with warnings.catch_warnings(record=True) as seen:\n"
         "    warnings.simplefilter('always')\n"
-        "    for _ in range(2): rasterize(z(2, 3), z(2, 4), z(2, 3), z(2), z(2, 1, 3), torch.eye(4), torch.eye(3), 4, 4)\n"
+        "    for _ in range(2): rasterize(z(2, 3), z(2, 4), z(2, 3), z(2), z(2, 1, 3), torch.eye(4), torch.eye(3), "
+        "4, 4)\n"
         "print([str(w.message) for w in seen if 'reference rasterizer' in str(w.message)])\n"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

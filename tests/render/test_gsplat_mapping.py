@@ -37,9 +37,26 @@ def _rasterization(
     assert viewmats.shape == (1, 4, 4) and Ks.shape == (1, 3, 3) and not packed and far_plane == 1e10
     n = means.shape[0]
     inputs = base.RenderInputs(
-        means, quats, scales, opacities, torch.zeros(n, 1, 3), viewmats[0], Ks[0], width, height, 0, colors, None, False, 0.0,
-        near_plane, eps2d, {"classic": False, "antialiased": True}[rasterize_mode], False, False,
-    )  # fmt: skip
+        means,
+        quats,
+        scales,
+        opacities,
+        torch.zeros(n, 1, 3),
+        viewmats[0],
+        Ks[0],
+        width,
+        height,
+        0,
+        colors,
+        None,
+        False,
+        0.0,
+        near_plane,
+        eps2d,
+        {"classic": False, "antialiased": True}[rasterize_mode],
+        False,
+        False,
+    )
     out = rasterize_torch(inputs)
     # means2d takes part in the graph, so that its hook runs; gsplat fills `absgrad` before it does
     means2d = means[None, :, :2] * 1.0

@@ -56,7 +56,8 @@ def test_changes_are_told_in_words():
     }
     said = changes(old, new)
     assert said == (
-        "phases.sharpen.steps was 600, is 20; the scene's file start/0.png changed; the code of p2gs.x changed; and 2 more"
+        "phases.sharpen.steps was 600, is 20; the scene's file start/0.png changed; the code of p2gs.x changed; and "
+        "2 more"
     )
     assert changes(old, old) == "" and changes({"a": None}, {"a": None}) == ""
 

@@ -61,7 +61,10 @@ def write_board(path: Path) -> None:
     for k in range(11):
         x = px(left + 0.010 * k)
         cv2.line(page, (x, y), (x, y - px(0.004 if k % 5 else 0.006)), 0, 4)
-    text = "p2gs: print at 100 %. This ruler is 100 mm long. Lay flat on the floor beside the object; leave it there for both states."
+    text = (
+        "p2gs: print at 100 %. This ruler is 100 mm long. Lay flat on the floor beside the object; leave it there "
+        "for both states."
+    )
     cv2.putText(page, text, (px(left), y + px(0.008)), cv2.FONT_HERSHEY_SIMPLEX, 1.0, 0, 2, cv2.LINE_AA)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

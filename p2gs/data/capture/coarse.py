@@ -107,9 +107,20 @@ class Splat:
     def render(self, camera: Camera, background: Tensor | None = None, features: Tensor | None = None):
         p = self.params
         return rasterize_stored(
-            p["means"], p["quats"], p["log_scales"], p["opacity_logits"], p["sh"], None, camera.viewmat, camera.K, camera.width,
-            camera.height, background=background, features=features, median_depth=False,
-        )  # fmt: skip
+            p["means"],
+            p["quats"],
+            p["log_scales"],
+            p["opacity_logits"],
+            p["sh"],
+            None,
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            background=background,
+            features=features,
+            median_depth=False,
+        )
 
 
 def initial(region: Region, xyz: np.ndarray, rgb: np.ndarray, seed: int = 0) -> Splat:

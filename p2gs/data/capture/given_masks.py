@@ -51,7 +51,8 @@ def read_mask(path: Path, shot: Shot, ignore: bool) -> np.ndarray:
     height, width = mask.shape
     if abs(width * shot.height - height * shot.width) > 0.01 * width * shot.height:
         raise UserError(
-            f"{path}: is {width}x{height} pixels, which is not the shape of {shot.source} ({shot.width}x{shot.height} upright)"
+            f"{path}: is {width}x{height} pixels, which is not the shape of {shot.source} "
+            f"({shot.width}x{shot.height} upright)"
         )
     if (height, width) != (shot.height, shot.width):
         mask = cv2.resize(mask, (shot.width, shot.height), interpolation=cv2.INTER_AREA)
@@ -85,6 +86,7 @@ def shown(masks: dict[str, np.ndarray], where: Path) -> dict[str, np.ndarray]:
         left, of = (sum(n.startswith(state) for n in names) for names in (out, masks))
         if left < MIN_PHOTOS:
             raise UserError(
-                f"{where}: state '{state}': {of - left} of {of} masks are empty, expected at least {MIN_PHOTOS} with white pixels"
+                f"{where}: state '{state}': {of - left} of {of} masks are empty, expected at least {MIN_PHOTOS} with "
+                "white pixels"
             )
     return out

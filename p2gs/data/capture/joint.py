@@ -179,8 +179,14 @@ def _relative(model: Model, start: Model, end: Model) -> np.ndarray:
         for _ in range(2):  # the second point of the joint model's cameras depends on the scale
             scale = np.cbrt(np.linalg.det(T[:3, :3]))
             reach = 0.3 * other.centre()[1] * scale
-            there = [p for k in keys for p in (model.photos[k + shift].position,
-                                               model.photos[k + shift].position + reach * model.photos[k + shift].forward)]  # fmt: skip
+            there = [
+                p
+                for k in keys
+                for p in (
+                    model.photos[k + shift].position,
+                    model.photos[k + shift].position + reach * model.photos[k + shift].forward,
+                )
+            ]
             T = similarity(own, np.array(there))
         return T
 

@@ -55,9 +55,13 @@ def _plan(model: Model, box: np.ndarray, axes: tuple[int, int], title: str) -> s
         parts.append('<line x1="%.1f" y1="%.1f" x2="%.1f" y2="%.1f" stroke="%s" stroke-width="2"/>' % (*a, *b, colour))
     (x0, y0), (x1, y1) = at(box[0]), at(box[1])
     parts.append(
-        f'<rect x="{x0:.1f}" y="{y1:.1f}" width="{x1 - x0:.1f}" height="{y0 - y1:.1f}" fill="none" stroke="#090" stroke-width="2"/>'
+        f'<rect x="{x0:.1f}" y="{y1:.1f}" width="{x1 - x0:.1f}" height="{y0 - y1:.1f}" fill="none" stroke="#090" '
+        'stroke-width="2"/>'
     )
-    return f'<figure><svg viewBox="0 0 600 600" width="480">{"".join(parts)}</svg><figcaption>{html.escape(title)}</figcaption></figure>'
+    return (
+        '<figure><svg viewBox="0 0 600 600" '
+        f'width="480">{"".join(parts)}</svg><figcaption>{html.escape(title)}</figcaption></figure>'
+    )
 
 
 def write_page(scene: Path, model: Model, box: np.ndarray, facts: dict) -> None:
@@ -71,7 +75,8 @@ def write_page(scene: Path, model: Model, box: np.ndarray, facts: dict) -> None:
     brief = {k: v for k, v in facts.items() if k not in ("images", "gains")}
     (scene / "capture.html").write_text(
         f"""<!doctype html><meta charset="utf-8"><title>capture</title><style>body{{font:15px sans-serif;margin:2em}}
-figure{{display:inline-block;margin:0 1em}}</style><h1>{html.escape(scene.name)}</h1>{_plan(model, box, (0, 1), "from above")}
+figure{{display:inline-block;margin:0 1em}}</style><h1>{html.escape(scene.name)}</h1>
+{_plan(model, box, (0, 1), "from above")}
 {_plan(model, box, (0, 2), "from the side")}<ul>{legend}<li style="color:#090">the object's box</li></ul>
 <h2>Masks</h2><img src="contact.jpg" style="max-width:100%"><h2>Left out</h2><ul>{left_out or "<li>nothing</li>"}</ul>
 <h2>Figures</h2><pre>{html.escape(json.dumps(brief, indent=1))}</pre>"""

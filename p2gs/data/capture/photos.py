@@ -91,7 +91,8 @@ def copy_photos(source: Path, state: str, folder: Path, size: int, limit: int) -
     if any(p.suffix.lower() in HEIC for p in paths) and not heic_opener():
         first = next(p for p in paths if p.suffix.lower() in HEIC)
         raise UserError(
-            f"{first}: HEIC needs pillow-heif (pip install 'p2gs[heic]'), or set the phone to take JPEG ('most compatible')"
+            f"{first}: HEIC needs pillow-heif (pip install 'p2gs[heic]'), or set the phone to take JPEG ('most "
+            "compatible')"
         )
     if len(paths) > limit:
         paths = [paths[i] for i in np.linspace(0, len(paths) - 1, limit).round().astype(int)]

@@ -114,7 +114,8 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     bias = facts["bias"]
     if bias["share_of_distance"] is not None and bias["share_of_distance"] > WARN_BIAS:
         progress(
-            f"warning: the states are {100 * bias['share_of_distance']:.2f} % of the distance apart on the static scene (capture.json)"
+            f"warning: the states are {100 * bias['share_of_distance']:.2f} % of the distance apart on the static "
+            "scene (capture.json)"
         )
     return out
 
@@ -168,8 +169,12 @@ def _reconstructed(state: str, shots: list[Shot], work: Path, cache: Cache, care
     total, result = len(shots), {"registered": 0, "models": 0}
     for effort in [True] if careful else [False, True]:
         name = f"{state}_careful" if effort else state
-        job = {"images": str((work / "photos").resolve()), "groups": lens_groups(shots), "effort": default_effort(effort),
-               "out": str((work / name).resolve())}  # fmt: skip
+        job = {
+            "images": str((work / "photos").resolve()),
+            "groups": lens_groups(shots),
+            "effort": default_effort(effort),
+            "out": str((work / name).resolve()),
+        }
         depends = [job, [(s.source, s.sharpness) for s in shots]]
 
         def make(job=job, name=name) -> dict:
@@ -227,7 +232,8 @@ def _check_arc(model: Model, state: str) -> None:
     angles = np.sort(np.degrees(np.arctan2(away @ np.cross(up, x), away @ x)))
     arc = 360 - np.diff(np.append(angles, angles[0] + 360)).max()
     if arc < MIN_ARC:
-        raise UserError(f"state '{state}': the photographs go only {arc:.0f} degrees around the object, expected at least {MIN_ARC:.0f}; "
+        raise UserError(f"state '{state}': the photographs go only {arc:.0f} degrees around the object, expected at "
+                        f"least {MIN_ARC:.0f}; "
                         "walk from one side of the front to the other, at two or three heights")  # fmt: skip
 
 
@@ -298,11 +304,15 @@ def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, bo
         "format": FORMAT,
         "images": images,
         "bias": {
-            "shift": bias.shift if known else None, "turn_degrees": bias.turn if known else None, "points": bias.points,
+            "shift": bias.shift if known else None,
+            "turn_degrees": bias.turn if known else None,
+            "points": bias.points,
             "share_of_distance": bias.shift / distance if known else None,
         },
         "share_of_points_in_both_states": float(seen.all(1).mean()) if len(seen) else 0.0,
         "lenses": {str(k): {**asdict(lens), "params": lens.params.tolist()} for k, lens in model.lenses.items()},
-        "gains": {files[p.name]: np.exp(found[k]).round(4).tolist() for k, p in model.photos.items() if p.name in files},
+        "gains": {
+            files[p.name]: np.exp(found[k]).round(4).tolist() for k, p in model.photos.items() if p.name in files
+        },
         "object_box": box.tolist(),
-    }  # fmt: skip
+    }

@@ -152,7 +152,8 @@ def state_of(name: str, start: Path, end: Path, in_start: bool, in_end: bool) ->
         if state in folders or folder.name in folders:
             return state
     raise UserError(
-        f"poses: {name} may belong to either state; put the photographs into folders start/ and end/ before solving the poses"
+        f"poses: {name} may belong to either state; put the photographs into folders start/ and end/ before solving "
+        "the poses"
     )
 
 
@@ -173,7 +174,8 @@ def onto_copies(model: Model, shots: list[Shot], start: Path, end: Path) -> Mode
         factor = shot.width / lens.width
         if abs(lens.height * factor - shot.height) > 2:
             raise UserError(
-                f"{shot.source}: is {shot.width}x{shot.height} upright, its pose is for {lens.width}x{lens.height} pixels; "
+                f"{shot.source}: is {shot.width}x{shot.height} upright, its pose is for {lens.width}x{lens.height} "
+                "pixels; "
                 "solve the poses with upright photographs"
             )
         params = lens.params.copy()

@@ -85,9 +85,14 @@ def _features(pycolmap, database: Path, job: dict, group: dict, effort: Effort) 
     if group["params"]:
         reader.camera_params = ",".join(repr(float(p)) for p in group["params"])
     pycolmap.extract_features(
-        database, job["images"], image_names=group["names"], camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
-        extraction_options=options, device=pycolmap.Device.cpu,
-    )  # fmt: skip
+        database,
+        job["images"],
+        image_names=group["names"],
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
+    )
 
 
 def _match(pycolmap, database: Path, threads: int, effort: Effort) -> None:

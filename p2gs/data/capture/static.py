@@ -15,7 +15,10 @@ from p2gs.types import UserError
 
 # of the cameras' distance: hypotheses that move the object's place by less than this are one; a board alone is as exact
 SAME = 0.04
-ADVICE = "lay newspapers, a patterned rug or the printed board (p2gs data board) around the object and photograph both states again"
+ADVICE = (
+    "lay newspapers, a patterned rug or the printed board (p2gs data board) around the object and photograph "
+    "both states again"
+)
 
 
 def apart(model: Model, A: np.ndarray, B: np.ndarray) -> float:
@@ -56,13 +59,15 @@ def choose(found: list[Hypothesis], given: int | None, where: Path) -> int:
         raise UserError(f"{where}: the two states show too little in common (fewer than {MIN_VOTES} points); {ADVICE}")
     if not found[0].wide:
         raise UserError(
-            f"{where}: what both states show in common reaches over {found[0].spread:.2f} of the cameras' distance only, "
+            f"{where}: what both states show in common reaches over {found[0].spread:.2f} of the cameras' distance "
+            "only, "
             f"so it may be a moving part and not the room; {ADVICE}"
         )
     rivals = [i for i, h in enumerate(found[1:], 1) if h.wide and h.spread > RIVAL * found[0].spread]
     if rivals:
         raise UserError(
-            f"{where}: hypotheses 0 and {rivals[0]} both reach through the room, so something large moved besides the parts; "
+            f"{where}: hypotheses 0 and {rivals[0]} both reach through the room, so something large moved besides "
+            "the parts; "
             f"leave the room as it is, or choose with --static 0 or --static {rivals[0]}"
         )
     return 0
@@ -79,7 +84,8 @@ def check_joint_support(model: Model) -> dict:
     rows = np.flatnonzero(states_of(model).all(1))
     if len(rows) < MIN_VOTES:
         raise UserError(
-            f"the poses' two states share {len(rows)} points, expected at least {MIN_VOTES}: they need not lie in one frame; {ADVICE}"
+            f"the poses' two states share {len(rows)} points, expected at least {MIN_VOTES}: they need not lie in "
+            f"one frame; {ADVICE}"
         )
     spread, outside = extent(model, rows)
     support = Hypothesis(np.eye(4), np.stack([rows, rows], 1), spread, outside)

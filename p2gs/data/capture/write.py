@@ -74,9 +74,17 @@ def write_scene(
         c2w = np.linalg.inv(photo.viewmat)
         c2w[:3, 1:3] *= -1
         frames[state].append(
-            {"file_path": path, "transform_matrix": c2w.tolist(), "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2],
-             "w": lens.width, "h": lens.height}
-        )  # fmt: skip
+            {
+                "file_path": path,
+                "transform_matrix": c2w.tolist(),
+                "fl_x": K[0, 0],
+                "fl_y": K[1, 1],
+                "cx": K[0, 2],
+                "cy": K[1, 2],
+                "w": lens.width,
+                "h": lens.height,
+            }
+        )
         normal = lens.rays(photo.xy)
         flat[key] = replace(photo, name=path, xy=normal * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]])
     for state in STATES:
@@ -86,8 +94,15 @@ def write_scene(
         (out / f"transforms_train_{state}.json").write_text(json.dumps({"frames": frames[state]}, indent=1))
         own = [{**f, "file_path": f["file_path"].removeprefix(f"{state}/")} for f in frames[state]]
         (out / state / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": own}, indent=1))
-    lenses = {k: Lens("PINHOLE", model.lenses[k].width, model.lenses[k].height, np.array([p.K[0, 0], p.K[1, 1], p.K[0, 2], p.K[1, 2]]))
-              for k, p in pinholes.items()}  # fmt: skip
+    lenses = {
+        k: Lens(
+            "PINHOLE",
+            model.lenses[k].width,
+            model.lenses[k].height,
+            np.array([p.K[0, 0], p.K[1, 1], p.K[0, 2], p.K[1, 2]]),
+        )
+        for k, p in pinholes.items()
+    }
     used = np.unique(np.concatenate([p.point for p in flat.values()]))
     keep = np.isin(model.ids, used)
     write_model(Model(lenses, flat, model.ids[keep], model.xyz[keep], model.rgb[keep]), out / "sparse/0")

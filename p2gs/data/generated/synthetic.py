@@ -12,6 +12,7 @@ from typing import Optional
 import numpy as np
 import torch
 
+from p2gs.data.generated import gadgets  # noqa: F401  (registers its kinds)
 from p2gs.data.generated.articulated import SyntheticObject
 from p2gs.data.generated.furniture import KINDS, demo_cabinet
 from p2gs.data.generated.raytrace import Shadow, render

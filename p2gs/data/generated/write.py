@@ -143,7 +143,8 @@ def write_scene(
         raise UserError(f"unknown data format '{format}'{suggest(format, WRITERS)}")
     if size < 16 or train_views < 1 or test_views < 0:
         raise UserError(
-            f"a scene needs images of at least 16 pixels and one training view, not size={size}, train_views={train_views}"
+            f"a scene needs images of at least 16 pixels and one training view, not size={size}, "
+            f"train_views={train_views}"
         )
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise UserError(f"{root}: is not an empty folder, and a generated scene does not overwrite files")

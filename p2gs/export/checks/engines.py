@@ -82,7 +82,10 @@ class EngineResult:
     def remark(self) -> str:
         """How far the joint that went least went, and the fastest motion at rest."""
         least = min((hi - lo for lo, hi in self.reached.values()), default=0.0)
-        return f"{len(self.reached)} joints, each through {100 * least:.0f} % of its range or more; at rest {max(self.speed):.1g} per s"
+        return (
+            f"{len(self.reached)} joints, each through {100 * least:.0f} % of its range or more; at rest "
+            f"{max(self.speed):.1g} per s"
+        )
 
 
 def joint_facts(urdf: Path) -> list[JointFacts]:

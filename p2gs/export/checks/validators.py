@@ -119,7 +119,8 @@ def gltf_validator_path() -> str | None:
 
 GLTF_SCRIPT = """const [path, file] = process.argv.slice(1);
 require(path).validateBytes(new Uint8Array(require('fs').readFileSync(file)), {maxIssues: 0})
-  .then(report => process.stdout.write(JSON.stringify(report.issues.messages)), error => { console.error(error); process.exit(1); });"""
+  .then(report => process.stdout.write(JSON.stringify(report.issues.messages)),
+        error => { console.error(error); process.exit(1); });"""
 WRONG = 1  # the highest severity that is told: 0 error, 1 warning
 
 

@@ -236,7 +236,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         "<tr>" + "".join(f'<td class="bad">{c}</td>' if c == "F" else f"<td>{c}</td>" for c in row) + "</tr>"
         for row in rows
     )
-    return f'<div class="scroll"><table><thead><tr>{"".join(f"<th>{h}</th>" for h in head)}</tr></thead><tbody>{body}</tbody></table></div>'
+    heads = "".join(f"<th>{h}</th>" for h in head)
+    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _vector(v: Any) -> str:

@@ -27,7 +27,8 @@ def view_section(run_dir: Path, obj: ArticulatedObject) -> str:
 
     asset = load_asset(run_dir, up="y", max_faces=PAGE_FACES, solid=False, splats=True)
     sliders = [
-        f'<label><span>{chip(link.part)}{link.part} {link.joint.type}</span><input type="range" min="0" max="1" step="0.005" value="0" '
+        f'<label><span>{chip(link.part)}{link.part} {link.joint.type}</span><input type="range" min="0" max="1" '
+        'step="0.005" value="0" '
         f'data-part="{link.part}" aria-label="joint {link.part}"><output>0</output></label>'
         for link in asset.moving
     ]
@@ -35,12 +36,16 @@ def view_section(run_dir: Path, obj: ArticulatedObject) -> str:
     splats = [_embedded(spz_bytes(link.splats), "splats", f'data-node="{link.name}"') for link in full]
     spark = resources.files("p2gs.export").joinpath("spark", "spark.js.gz").read_bytes()
     return (
-        f'<h2>Move it</h2>\n<div class="views"><figure><canvas id="view" data-turn="{front(obj):.3f}" aria-label="the mesh in 3D"></canvas>'
-        '<figcaption class="soft" id="view-note">The mesh. Drag to turn, scroll or pinch to come nearer. Zero is the start state.'
+        f'<h2>Move it</h2>\n<div class="views"><figure><canvas id="view" data-turn="{front(obj):.3f}" '
+        'aria-label="the mesh in 3D"></canvas>'
+        '<figcaption class="soft" id="view-note">The mesh. Drag to turn, scroll or pinch to come nearer. Zero is the '
+        "start state."
         "</figcaption>"
         '</figure><figure><canvas id="splats" aria-label="the Gaussians in 3D"></canvas>'
-        '<figcaption class="soft" id="splats-note">The Gaussians, which the photographs were explained with.</figcaption></figure></div>\n'
-        f'<div class="sliders">{"".join(sliders)}<label><span>part colours</span><input type="checkbox" id="paint"></label></div>\n'
+        '<figcaption class="soft" id="splats-note">The Gaussians, which the photographs were explained '
+        "with.</figcaption></figure></div>\n"
+        f'<div class="sliders">{"".join(sliders)}<label><span>part colours</span><input type="checkbox" '
+        'id="paint"></label></div>\n'
         + "\n".join([_embedded(glb_bytes(asset), "glb"), _embedded(spark, "spark"), *splats])
         + f"\n<script>\n{_script('report_viewer.js')}</script>\n<script>\n{_script('report_splats.js')}</script>"
     )

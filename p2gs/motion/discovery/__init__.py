@@ -7,6 +7,15 @@ from p2gs.motion.discovery.result import Candidate, Discovery, FoundMotion
 from p2gs.visibility.depth_stack import StateEvidence
 
 __all__ = [
-    "Candidate", "Discovery", "DiscoveryConfig", "FoundMotion", "StateEvidence", "discover", "in_two", "instead_of", "places_changed",
-    "relabel", "surface_energy",
-]  # fmt: skip
+    "Candidate",
+    "Discovery",
+    "DiscoveryConfig",
+    "FoundMotion",
+    "StateEvidence",
+    "discover",
+    "in_two",
+    "instead_of",
+    "places_changed",
+    "relabel",
+    "surface_energy",
+]

@@ -170,9 +170,20 @@ class Landing:
         if cost.numel():
             moving, thick = motions.packed(), motions.thick.float().contiguous()
             native.landing_cost(
-                *self.tables(), 0 if claimed is None else claimed.data_ptr(), [m.data_ptr() for m in moving], thick.data_ptr(), len(motions), back,
-                source.rows.data_ptr(), len(source.rows), index.data_ptr(), len(index), cost.data_ptr(), met.data_ptr(), num_threads(),
-            )  # fmt: skip
+                *self.tables(),
+                0 if claimed is None else claimed.data_ptr(),
+                [m.data_ptr() for m in moving],
+                thick.data_ptr(),
+                len(motions),
+                back,
+                source.rows.data_ptr(),
+                len(source.rows),
+                index.data_ptr(),
+                len(index),
+                cost.data_ptr(),
+                met.data_ptr(),
+                num_threads(),
+            )
         return cost, met
 
     @property

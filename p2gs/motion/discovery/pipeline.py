@@ -93,10 +93,18 @@ def discover(
     candidates = [describe(problem, e, start, end) for e in explanations]
     best = candidates[0]
     out = Discovery(
-        motions=best.motions, surfels=best.surfels, probability=best.probability, score=best.score,
-        labels_start=best.labels_start, labels_end=best.labels_end, candidates=candidates, diagnostics=figures | {"seconds": seconds},
-        problem=problem, graphs=graphs, search=search,
-    )  # fmt: skip
+        motions=best.motions,
+        surfels=best.surfels,
+        probability=best.probability,
+        score=best.score,
+        labels_start=best.labels_start,
+        labels_end=best.labels_end,
+        candidates=candidates,
+        diagnostics=figures | {"seconds": seconds},
+        problem=problem,
+        graphs=graphs,
+        search=search,
+    )
     out.margin_start = best.label_points(start.points, start.colours, 0)[1]
     out.margin_end = best.label_points(end.points, end.colours, 1)[1]
     out.evidence_start, out.evidence_end = (nearest_evidence(problem, e.points, s) for s, e in enumerate((start, end)))
@@ -354,11 +362,15 @@ def found_motions(problem: Problem, motions: Motions, labelling: Labelling) -> l
         origin = origin + axis * ((middle - origin) @ axis) if turn else middle
         found.append(
             FoundMotion(
-                type="revolute" if turn else "prismatic", transform=T, axis=axis, origin=origin,
+                type="revolute" if turn else "prismatic",
+                transform=T,
+                axis=axis,
+                origin=origin,
                 amount=math.degrees(float(motions.amount[k])) if turn else float(motions.amount[k]),
-                confidence=float(max(0.0, min(agree)) * plausible[k].clamp(0, 1) * min(1.0, mass[k] / 0.05)), mass=mass[k],
+                confidence=float(max(0.0, min(agree)) * plausible[k].clamp(0, 1) * min(1.0, mass[k] / 0.05)),
+                mass=mass[k],
             )
-        )  # fmt: skip
+        )
     return found
 
 

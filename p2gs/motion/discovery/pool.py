@@ -84,9 +84,18 @@ def joint_sums(problem: Problem, motions: Motions, pays: list[Tensor], samples: 
         )
         out = torch.empty(len(motions), 4)
         native.evidence_joints(
-            rows.data_ptr(), len(rows), index.data_ptr(), n, pay.data_ptr(), axis.data_ptr(), centre.data_ptr(), len(motions),
-            min(max(1, int(0.01 * n)), n), out.data_ptr(), num_threads(),
-        )  # fmt: skip
+            rows.data_ptr(),
+            len(rows),
+            index.data_ptr(),
+            n,
+            pay.data_ptr(),
+            axis.data_ptr(),
+            centre.data_ptr(),
+            len(motions),
+            min(max(1, int(0.01 * n)), n),
+            out.data_ptr(),
+            num_threads(),
+        )
         total += out[:, :3] / max(1, n)
         near = torch.minimum(near, out[:, 3])
     return near, total[:, 1], total[:, 0], total[:, 2] + 1e-6

@@ -27,10 +27,22 @@ def normal_equations(problem: Problem, motions: Motions, samples: list[Tensor], 
         landing, source = problem.landings[1 - s], problem.landings[s]
         index, w = samples[s].contiguous(), weights[s].float().contiguous()
         native.landing_fit(
-            *landing.tables(), [m.data_ptr() for m in moving], len(motions), basis.data_ptr(), s == 1, source.rows.data_ptr(),
-            len(source.rows), index.data_ptr(), w.data_ptr(), len(index), width, landing.hc + 2 * problem.scale.spacing, A.data_ptr(),
-            b.data_ptr(), num_threads(),
-        )  # fmt: skip
+            *landing.tables(),
+            [m.data_ptr() for m in moving],
+            len(motions),
+            basis.data_ptr(),
+            s == 1,
+            source.rows.data_ptr(),
+            len(source.rows),
+            index.data_ptr(),
+            w.data_ptr(),
+            len(index),
+            width,
+            landing.hc + 2 * problem.scale.spacing,
+            A.data_ptr(),
+            b.data_ptr(),
+            num_threads(),
+        )
     return A, b
 
 
