@@ -166,6 +166,21 @@ def parser(prog: str = "p2gs") -> Parser:
     synth.add_argument("--format", choices=("artgs", "dta", "paris"), default="artgs", help="layout (default artgs)")
     synth.add_argument("--no_depth", action="store_true", help="write no depth maps")
 
+    about = "Render a URDF or MJCF asset in two states as a scene with ground truth; without --joints, list its joints."
+    render = actions.add_parser("render", help="a URDF or MJCF in two states as a scene", description=about)
+    render.add_argument("asset", metavar="ASSET", help="URDF or MJCF file")
+    render.add_argument("out", metavar="OUT", nargs="?", help="folder to write")
+    render.add_argument("--joints", metavar="NAME=START:END,...", help="degrees or lengths; other joints rest")
+    render.add_argument("--format", choices=("artgs", "dta", "paris"), default="artgs", help="layout (default artgs)")
+    render.add_argument("--size", type=int, default=400, metavar="PX", help="image size (default 400)")
+    render.add_argument("--views", type=int, default=64, metavar="N", help="training views a state (default 64)")
+    render.add_argument("--test_views", type=int, default=10, metavar="N", help="test views a state (default 10)")
+    render.add_argument("--seed", type=int, default=0, metavar="S", help="of the cameras")
+    render.add_argument("--samples", type=int, default=9, metavar="N", help="rays a pixel, a square (default 9)")
+    render.add_argument("--cameras", metavar="SCENE", help="take the cameras of this scene")
+    render.add_argument("--no_depth", action="store_true", help="write no depth maps")
+    render.add_argument("--renderer", choices=("embree", "mitsuba"), default="embree", help="what makes the colours")
+
     about = "Turn photographs (or videos) of two joint states into a scene."
     capture = actions.add_parser("capture", help="photographs of two states to a scene", description=about)
     capture.add_argument("start", metavar="SHUT", help="folder of photographs of the first state, or a video")

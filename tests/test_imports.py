@@ -49,6 +49,7 @@ OPTIONAL = [
     "mujoco",
     "yourdfpy",
     "embreex",
+    "mitsuba",
     "hypothesis",
     "matplotlib",
     "submitit",

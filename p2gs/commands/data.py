@@ -1,4 +1,4 @@
-"""The commands on scene folders: ``p2gs data check``, ``synth``, ``prepare``, ``capture`` and ``board``.
+"""The commands on scene folders: ``p2gs data check``, ``synth``, ``render``, ``prepare``, ``capture`` and ``board``.
 
 Each takes the parsed arguments, returns the exit code."""
 
@@ -11,7 +11,8 @@ from p2gs.types import UserError
 
 
 def data(args: argparse.Namespace) -> int:
-    return {"check": check, "synth": synth, "prepare": prepare, "capture": capture, "board": board}[args.action](args)
+    actions = {"check": check, "synth": synth, "render": render, "prepare": prepare, "capture": capture, "board": board}
+    return actions[args.action](args)
 
 
 def prepare(args: argparse.Namespace) -> int:
@@ -55,6 +56,54 @@ def synth(args: argparse.Namespace) -> int:
         f"{folder}"
     )
     return 0
+
+
+def render(args: argparse.Namespace) -> int:
+    """An asset in two states as a scene; without --joints, the joints that it has."""
+    from pathlib import Path
+
+    from p2gs.data.render.scene import RenderOptions, listed, read_asset, render
+
+    if args.joints is None or args.out is None:
+        asset = read_asset(Path(args.asset))
+        print("\n".join(listed(asset)) or f"{args.asset}: no joint of it can move")
+        if args.out is not None:
+            raise UserError("data render: --joints is not given; expected NAME=START:END of joints above, with commas")
+        return 0
+    for name, least in (("size", 16), ("views", 1), ("test_views", 0)):
+        if getattr(args, name) < least:
+            raise UserError(f"data render: --{name} is {getattr(args, name)}, expected at least {least}")
+    cameras = None if args.cameras is None else Path(args.cameras)
+    options = RenderOptions(
+        args.format,
+        args.size,
+        args.views,
+        args.test_views,
+        args.seed,
+        args.samples,
+        cameras,
+        not args.no_depth,
+        args.renderer,
+    )
+    folder = render(Path(args.asset), args.joints, Path(args.out), options, Progress())
+    print(f"{folder}: written; train on it with: p2gs fit -c preset/cpu.yaml --data.root {folder}")
+    return 0
+
+
+class Progress:
+    """Notes a line each; where the work stands on one line of a terminal, or every 32nd line of a file."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, text: str) -> None:
+        if text.startswith("note: "):
+            print(text, flush=True)
+        elif sys.stdout.isatty():
+            print(f"\r{text}  ", end="", flush=True)
+        elif self.calls % 32 == 0:
+            print(text, flush=True)
+        self.calls += 1
 
 
 def board(args: argparse.Namespace) -> int:

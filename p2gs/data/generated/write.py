@@ -1,4 +1,4 @@
-"""Writes a generated object as a scene in one of the published layouts, ground truth included."""
+"""Writes an object that is drawn, not photographed, as a scene in one of the published layouts, with ground truth."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import json
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Literal, Optional
+from typing import Callable, Literal, Optional, Protocol, Sequence
 
 import numpy as np
 
 from p2gs.data.frames import STATES
 from p2gs.data.generated.articulated import SyntheticJoint, SyntheticObject, concatenate
-from p2gs.data.generated.synthetic import FOCAL, intrinsics, synthetic_scene
+from p2gs.data.generated.synthetic import synthetic_scene
 from p2gs.registry import suggest
 from p2gs.types import TwoStateScene, UserError, View
 
@@ -60,7 +60,19 @@ def joint_entry(joint: SyntheticJoint) -> dict:
     }
 
 
-def write_ground_truth(obj: SyntheticObject, folder: Path) -> None:
+class Drawn(Protocol):
+    """What can be written: the static part and the moving ones, joints of the latter, meshes by part and state."""
+
+    @property
+    def parts(self) -> Sequence: ...
+
+    @property
+    def joints(self) -> list[SyntheticJoint]: ...
+
+    def mesh(self, part: int, t: float) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+def write_ground_truth(obj: Drawn, folder: Path) -> None:
     """``trans.json`` and ``{state}/{state}_[static_|dynamic[_i]_]rotate.ply``."""
     import trimesh
 
@@ -76,8 +88,9 @@ def write_ground_truth(obj: SyntheticObject, folder: Path) -> None:
 
 
 def _write_artgs(scene: TwoStateScene, root: Path, depth: bool) -> Path:
-    angle = float(2 * np.arctan(0.5 / FOCAL))
-    head = {"camera_angle_x": angle, "camera_angle_y": angle}
+    camera = scene.views[0].camera
+    angles = (2 * np.arctan(0.5 * n / float(camera.K[i, i])) for i, n in enumerate((camera.width, camera.height)))
+    head = dict(zip(("camera_angle_x", "camera_angle_y"), map(float, angles), strict=True))
     _json(root / "transforms_train.json", {**head, "frames": []})  # ArtGS only tests that it is there
     for s, state in enumerate(STATES):
         for split in ("train", "test"):
@@ -93,7 +106,7 @@ def _write_artgs(scene: TwoStateScene, root: Path, depth: bool) -> Path:
 
 
 def _write_dta(scene: TwoStateScene, root: Path, depth: bool) -> Path:
-    size, lines = scene.views[0].camera.width, []
+    lines = []
     for v in scene.select(split="train"):
         name = f"{v.state}_{v.name}"
         _png(root / "color_segmented" / f"{name}.png", _bgra(v)[..., :3] * (v.alpha.numpy() > 127)[..., None])
@@ -103,14 +116,14 @@ def _write_dta(scene: TwoStateScene, root: Path, depth: bool) -> Path:
         numbers = ", ".join(repr(x) for row in opengl_c2w(v) for x in row)
         lines.append(f"frame_{name}:\n  cam_in_ob: [{numbers}]\n  time: {v.state}\n")
     (root / "init_keyframes.yml").write_text("".join(lines))
-    np.savetxt(root / "cam_K.txt", intrinsics(size))
+    np.savetxt(root / "cam_K.txt", scene.views[0].camera.K.double().numpy())
     return root / "gt"
 
 
 def _write_paris(scene: TwoStateScene, root: Path, depth: bool) -> Path:
     for s, state in enumerate(STATES):
         for split in ("train", "test"):
-            cameras: dict = {"K": intrinsics(scene.views[0].camera.width).tolist()}
+            cameras: dict = {"K": scene.views[0].camera.K.double().tolist()}
             for v in scene.select(s, split):
                 _png(root / "load" / state / split / f"{v.name}.png", _bgra(v))
                 cameras[v.name] = opengl_c2w(v)
@@ -138,22 +151,33 @@ def write_scene(
     PARIS no depth. The folder appears only when all of it is written.  Raises UserError for an unknown format, sizes
     below 16 pixels, no training view, and where ``out_dir`` is not empty.
     """
-    root = Path(out_dir)
-    if format not in WRITERS:
-        raise UserError(f"unknown data format '{format}'{suggest(format, WRITERS)}")
     if size < 16 or train_views < 1 or test_views < 0:
         raise UserError(
             f"a scene needs images of at least 16 pixels and one training view, not size={size}, "
             f"train_views={train_views}"
         )
+    kept = recipe or {"name": obj.name, "size": size, "seed": seed}
+
+    def draw() -> TwoStateScene:
+        return synthetic_scene(obj, size, train_views, test_views, seed)
+
+    return write_views(draw, obj, Path(out_dir), format, depth, ("synthetic.json", kept))
+
+
+def write_views(
+    draw: Callable[[], TwoStateScene], obj: Drawn, root: Path, format: str, depth: bool, recipe: tuple[str, dict]
+) -> Path:
+    """Draw and write images, cameras, depth (millimetres), ground truth and the recipe (file name, content). The folder
+    appears only when all of it is written.  Raises UserError for an unknown format, and where ``root`` is not empty."""
+    if format not in WRITERS:
+        raise UserError(f"unknown data format '{format}'{suggest(format, WRITERS)}")
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise UserError(f"{root}: is not an empty folder, and a generated scene does not overwrite files")
     root.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{root.name}-", dir=root.parent))
     try:
-        scene = synthetic_scene(obj, size, train_views, test_views, seed)
-        write_ground_truth(obj, WRITERS[format](scene, partial, depth))
-        _json(partial / "synthetic.json", recipe or {"name": obj.name, "size": size, "seed": seed})
+        write_ground_truth(obj, WRITERS[format](draw(), partial, depth))
+        _json(partial / recipe[0], recipe[1])
         partial.chmod(0o755)
         partial.replace(root)
     finally:
