@@ -342,9 +342,6 @@ def local_scenes(root: Path) -> Iterator[Scene]:
         yield Scene(name, name, str(folder), format, None, None if truth is None else len(truth.joints) + 1)
 
 
-#
-#
-#
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 

@@ -110,9 +110,6 @@ def summary(results: Results) -> Grid:
     return Grid("summary", title, ["Object", "Setting"], [METRICS[m].title for m in metrics], rows)
 
 
-#
-#
-#
 # -- tests ------------------------------------------------------------------------------------------------------------
 
 
@@ -204,9 +201,6 @@ def significance(tests: list[Test]) -> str:
     return "\n".join(lines) + "\n"
 
 
-#
-#
-#
 # -- the page ---------------------------------------------------------------------------------------------------------
 
 

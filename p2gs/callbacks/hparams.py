@@ -52,9 +52,6 @@ def layout(phase_name: str, losses: dict[str, Any]) -> dict:
     return out
 
 
-#
-#
-#
 # -- after the run ----------------------------------------------------------------------------------------------------
 
 

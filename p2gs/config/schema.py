@@ -120,9 +120,6 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-#
-#
-#
 # -- mistakes, told in a sentence -------------------------------------------------------------------------------------
 
 

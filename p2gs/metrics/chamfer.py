@@ -61,7 +61,7 @@ class ChamferReport:
         }
 
 
-def read_mesh(path: Path | str | None) -> Triangles | None:
+def read_surface(path: Path | str | None) -> Triangles | None:
     """A mesh file that trimesh reads (ply, obj, stl, glb), scene graphs joined; None for no path or no such file."""
     import trimesh
 
@@ -75,7 +75,7 @@ def read_part_meshes(
     """The meshes of one state from their files; a movable part without a file becomes an empty mesh (it keeps its
     number)."""
     empty = Mesh.empty()
-    return PartMeshes(read_mesh(static), [read_mesh(m) or empty for m in movable], read_mesh(whole))
+    return PartMeshes(read_surface(static), [read_surface(m) or empty for m in movable], read_surface(whole))
 
 
 def is_empty(mesh: Triangles | None) -> bool:

@@ -178,9 +178,6 @@ class ArticulationPhase(ImagePhase):
         self.register_buffer("spacing", torch.zeros(()))
         self.place_repel_points(0)
 
-    #
-    #
-    #
     # -- parameters ---------------------------------------------------------------------------------------------------
     def parameter_groups(self):
         rates = self.config.rates.at(0.0)
@@ -203,9 +200,6 @@ class ArticulationPhase(ImagePhase):
         fraction = step / max(self.total_steps * self.config.harden_until, 1e-9)
         return exponential(self.config.temperature, self.config.temperature_end, fraction)
 
-    #
-    #
-    #
     # -- one step -----------------------------------------------------------------------------------------------------
     def inputs(self, visit: Visit) -> LossInputs:
         step, state = visit.step, visit.state
@@ -303,9 +297,6 @@ class ArticulationPhase(ImagePhase):
         for name in ("repel_points", "knn_index"):
             setattr(self, name, torch.empty_like(checkpoint["state_dict"][name]))
 
-    #
-    #
-    #
     # -- results ------------------------------------------------------------------------------------------------------
     @torch.no_grad()
     def hand_over(self) -> Articulation:

@@ -60,9 +60,6 @@ class Phase(LightningModule, Stage):
         self.loss_cache: dict = {}
         self.track_gradients = False  # set by the densification callback
 
-    #
-    #
-    #
     # -- what a subclass gives ----------------------------------------------------------------------------------------
     def parameter_groups(self) -> dict[str, tuple[list[Tensor], float]]:
         """name -> (parameters, learning rate at step 0)."""
@@ -88,9 +85,6 @@ class Phase(LightningModule, Stage):
         """Numbers worth plotting that are no losses (joint parameters, part masses)."""
         return {}
 
-    #
-    #
-    #
     # -- what all share -----------------------------------------------------------------------------------------------
     @property
     def step(self) -> int:

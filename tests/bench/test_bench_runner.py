@@ -175,9 +175,6 @@ def test_the_live_matrix_has_a_sign_a_run_and_the_time_left(bench_file):
     assert "2/8 runs, about 2:55 left" in console.file.getvalue() and "the sky fell" in console.file.getvalue()
 
 
-#
-#
-#
 # -- clusters ---------------------------------------------------------------------------------------------------------
 
 

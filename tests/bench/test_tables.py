@@ -214,9 +214,6 @@ def test_mistakes_are_told(bench, tmp_path):
     assert (folder / "tables").exists() is False
 
 
-#
-#
-#
 # -- statistics -------------------------------------------------------------------------------------------------------
 
 

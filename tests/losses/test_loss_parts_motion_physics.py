@@ -42,9 +42,6 @@ def build(name, **options):
     return cls(**{"weight": 1.0, **options})
 
 
-#
-#
-#
 # -- the formulas as loops --------------------------------------------------------------------------------------------
 def kl(p, q):
     return sum(a * math.log(a / b) for a, b in zip(p, q, strict=True))
@@ -181,9 +178,6 @@ def test_losses_are_their_formulas(seed):
         assert loss(inputs).item() == pytest.approx(value, rel=1e-9), loss
 
 
-#
-#
-#
 # -- invariances ------------------------------------------------------------------------------------------------------
 @each_loss
 def test_the_world_frame_does_not_matter(name, options):
@@ -211,9 +205,6 @@ def test_the_sum_grows_with_the_number(name):
     torch.testing.assert_close(loss(doubled(inputs)), 2 * loss(inputs))
 
 
-#
-#
-#
 # -- gradients --------------------------------------------------------------------------------------------------------
 @each_loss
 def test_gradients_against_finite_differences(name, options):
@@ -264,9 +255,6 @@ def test_gradients_stay_finite_when_everything_is_certain_and_coincides(name, op
         assert g is None or torch.isfinite(g).all()
 
 
-#
-#
-#
 # -- what the terms are for -------------------------------------------------------------------------------------------
 def test_a_true_rigid_motion_costs_nothing_but_the_paper_velocity_charges_for_turning():
     inputs = make_inputs(seed=8, sharp=True, noise=0.0)
@@ -387,9 +375,6 @@ def test_contact_by_the_letter_punishes_containment_and_the_margin_does_not():
     assert build("contact")(touching).item() > 1e-3
 
 
-#
-#
-#
 # -- switches ---------------------------------------------------------------------------------------------------------
 @each_loss
 def test_missing_inputs_give_none(name, options):
