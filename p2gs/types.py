@@ -182,6 +182,13 @@ class RenderOutput:
     means2d_abs_grad: Optional[Tensor] = None
 
     @property
+    def painted(self) -> Tensor:
+        """``features``, of a view that was asked for them. Raises ValueError for another."""
+        if self.features is None:
+            raise ValueError("this view was drawn without features")
+        return self.features
+
+    @property
     def expected_depth(self) -> Tensor:
         """Mean z over what the ray hits, [H, W]; 0 where nothing is hit."""
         return torch.where(self.alpha > 1e-6, self.depth / self.alpha.clamp_min(1e-6), torch.zeros_like(self.depth))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Optional
+from typing import Any, Optional
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ from p2gs.motion.joint_confidence import (
     state_depth,
 )
 from p2gs.ops import se3
-from p2gs.types import ArticulatedObject, GaussianTensors
+from p2gs.types import ArticulatedObject, GaussianTensors, Part
 from p2gs.visibility.depth_stack import DepthStack, classify
 
 FORMAT = "p2gs-diagnostics/1"
@@ -73,16 +73,16 @@ def diagnose(
         stages.learned,
         stages.record,
     )
-    first = {"backend": twin_backend or backend, "device": device}
+    first: dict[str, Any] = {"backend": twin_backend or backend, "device": device}
     unit = 1.0 / twin.similarity.scale
-    render = {"backend": backend, "device": device}
+    render: dict[str, Any] = {"backend": backend, "device": device}
     level = max(n for s in (0, 1) for n in views[s].levels)
     coarse = common_level(views)
     stacks = [state_depth(state, views[s], coarse, count=16, **render) for s, state in enumerate(states)]
     single = {STATES[s.state]: reconstruction(s.gaussians, views[s.state], level, **first) for s in stages.found_in}
     for s in states:
         single[STATES[s.state]]["psnr_sharpened"] = reconstruction(s.gaussians, views[s.state], level, **render)["psnr"]
-    d = {
+    d: dict[str, Any] = {
         "format": FORMAT,
         "single_state": single,
         "motion_evidence": None if motions is None else motion_evidence(motions, stages.found_in),
@@ -96,7 +96,7 @@ def diagnose(
         "finish": {"parts": len(twin.parts), "notes": list(stages.notes)},
     }
     for part, evidence in zip(twin.parts[1:], record.evidence, strict=True):
-        row = {"part": part.id, "type": part.joint.type} | evidence.as_dict()
+        row = {"part": part.id, "type": joint_type(part)} | evidence.as_dict()
         if row["disagreement"] is not None:
             row["disagreement"] *= unit
         d["joints"].append(row)
@@ -299,17 +299,25 @@ def apart(a: Tensor, b: Tensor, points: Tensor) -> tuple[float, float]:
     return float((se3.apply(a.double(), p) - se3.apply(b.double(), p)).norm(dim=1).mean()), math.degrees(float(turn))
 
 
+def joint_type(part: Part) -> str:
+    """Of a moving part."""
+    assert part.joint is not None
+    return part.joint.type
+
+
 def polishing(record: FinishRecord, twin: ArticulatedObject, states, unit: float) -> dict:
     """Image loss of each direction before and after the last refinement, what became a drawer's; per joint what the
     refinement changed and how the two directions differ."""
     names = ("start_to_end", "end_to_start")
-    out = {n: {w: record.costs[w][i] for w in record.costs} for i, n in enumerate(names)} if record.costs else {}
+    out: dict[str, Any] = {}
+    if record.costs:
+        out = {n: {w: record.costs[w][i] for w in record.costs} for i, n in enumerate(names)}
     out["contents"] = record.contents
     out["joints"] = []
     for k, part in enumerate(twin.parts[1:]):
         points = states[0].gaussians.means[record.labels[0] == k + 1]
         shift, turn = apart(record.before[k], record.after[k], points)
-        row = {"part": part.id, "type": part.joint.type, "changed_degrees": turn, "changed": shift * unit}
+        row = {"part": part.id, "type": joint_type(part), "changed_degrees": turn, "changed": shift * unit}
         if "backward" in record.polish:
             shift, turn = apart(record.polish["forward"][k], record.polish["backward"][k], points)
             row |= {"disagreement_degrees": turn, "disagreement": shift * unit}

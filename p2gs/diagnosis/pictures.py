@@ -99,9 +99,7 @@ def chosen_shot(states, record: FinishRecord, views: dict[int, TrainingViews], s
     if bool(moving.any()):
         onehot = torch.nn.functional.one_hot(record.labels[s], parts + 1).float()[:, 1:16].contiguous()
         for i in picked:
-            share = (
-                draw(states[s].gaussians, mine.camera(i, coarse), features=onehot).features.mean((0, 1)).sqrt().sum()
-            )
+            share = draw(states[s].gaussians, mine.camera(i, coarse), features=onehot).painted.mean((0, 1)).sqrt().sum()
             if float(share) > best:
                 best, index = float(share), i
     return mine.get(index, fine, torch.ones(3))
@@ -132,7 +130,7 @@ def marked(
     paint = torch.zeros(len(g), 4)
     for value, colour in colours.items():
         paint[classes == value] = torch.tensor([*colour, 1.0])
-    layer = draw(g, camera, features=paint).features.numpy()
+    layer = draw(g, camera, features=paint).painted.numpy()
     grey = np.repeat(photo.mean(-1, keepdims=True), 3, -1) / 255 * 0.6 + 0.4
     out = grey * (1 - 0.75 * layer[..., 3:]) + 0.75 * layer[..., :3]
     return (out.clip(0, 1) * 255).round().astype(np.uint8)

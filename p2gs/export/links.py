@@ -71,6 +71,13 @@ class Link:
     splats: Optional[GaussianTensors] = None  # the part's Gaussians, in the link's frame like the rest
 
     @property
+    def hinge(self) -> Hinge:
+        """The joint of a link that moves. Raises ValueError for the base."""
+        if self.joint is None:
+            raise ValueError(f"the link '{self.name}' has no joint")
+        return self.joint
+
+    @property
     def origin(self) -> np.ndarray:
         return np.zeros(3) if self.joint is None else self.joint.origin
 

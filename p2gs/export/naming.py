@@ -63,7 +63,7 @@ def shut_motion(link: Link, rest: np.ndarray) -> np.ndarray:
         both = np.concatenate([points @ T[:3, :3].T + T[:3, 3], rest])
         return float(np.ptp(both, axis=0).prod())
 
-    start, end = np.eye(4), joint_motion(link.joint, link.joint.motion)
+    start, end = np.eye(4), joint_motion(link.hinge, link.hinge.motion)
     return start if room(start) <= room(end) else end
 
 
@@ -74,18 +74,18 @@ def label_of(link: Link, base: Link, up: np.ndarray) -> str:
     shape = shape_of(points, area)
     diagonal = float(np.linalg.norm(np.ptp(np.concatenate([points, rest]), axis=0)))
     small = shape.sides[0] < SMALL * diagonal
-    axis = link.joint.axis
+    axis = link.hinge.axis
     panel = shape.sides[2] < FLAT * shape.sides[1]
     normal = shut_motion(link, rest)[:3, :3] @ shape.axes[2]
-    if link.joint.type == "prismatic":
+    if link.hinge.type == "prismatic":
         if small:
             return "button"
         in_plane = panel and abs(float(normal @ axis)) < 1 - ALONG
         if in_plane and abs(float(normal @ up)) < ALONG:
             return "door"  # a sliding one
         return "lid" if abs(float(axis @ up)) > ALONG else "drawer"
-    away = np.cross(points - link.joint.origin, axis)
-    offset = np.linalg.norm(np.cross(shape.centre - link.joint.origin, axis))
+    away = np.cross(points - link.hinge.origin, axis)
+    offset = np.linalg.norm(np.cross(shape.centre - link.hinge.origin, axis))
     if offset < CENTRED * np.linalg.norm(away, axis=1).max():
         return "knob" if small else "wheel"
     if abs(float(axis @ up)) > ALONG:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields
 from pathlib import Path
-from typing import Iterator, Sequence
+from typing import Any, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -53,7 +53,7 @@ def draw(
     background: float | Sequence[float] = 1.0,
     *,
     backend: str | None = None,
-    **options,
+    **options: Any,
 ) -> RenderOutput:
     """One view of Gaussians that are in the camera's coordinates; background a grey value or RGB. No gradients; results
     on the CPU.
@@ -99,6 +99,7 @@ def joint_strokes(obj: ArticulatedObject, part: int, t: float, extent: float) ->
     the motion, off the part's leading end.
     """
     joint = obj.parts[part].joint
+    assert joint is not None  # the base has no strokes
     mine = (obj.part_ids == obj.parts[part].id) & (torch.sigmoid(obj.gaussians.opacity_logits) > 0.3)
     means = obj.gaussians.means[mine].double()
     if not len(means):

@@ -83,7 +83,7 @@ def read_splat_ply(path: Path | str) -> tuple[GaussianTensors, Optional[Tensor]]
     rows = _read_vertices(Path(path))
     names = rows.dtype.names or ()
     rest = sum(1 for n in names if n.startswith("f_rest_"))
-    need = [n for n in splat_dtype(rest // 3 + 1, False).names if n not in ("nx", "ny", "nz")]
+    need = [n for n in splat_dtype(rest // 3 + 1, False).names or () if n not in ("nx", "ny", "nz")]
     missing = [n for n in need if n not in names]
     if missing or rest // 3 + 1 not in (1, 4, 9, 16) or rest % 3:
         raise UserError(f"{path} is not a Gaussian splat PLY: column '{(missing or ['f_rest_*'])[0]}' is missing")
@@ -119,7 +119,7 @@ def _fill(rows: np.ndarray, names, values) -> None:
 def _header(dtype: np.dtype, count: int) -> bytes:
     kinds = {"f4": "float", "i4": "int"}
     lines = ["ply", "format binary_little_endian 1.0", "comment p2gs splats", f"element vertex {count}"]
-    lines += [f"property {kinds[dtype[n].str[1:]]} {n}" for n in dtype.names]
+    lines += [f"property {kinds[dtype[n].str[1:]]} {n}" for n in dtype.names or ()]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 

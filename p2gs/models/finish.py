@@ -4,7 +4,7 @@ joints."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, Sequence
+from typing import Any, Literal, Sequence
 
 import torch
 from torch import Tensor
@@ -199,7 +199,7 @@ def finish(
         rows = labels == k + 1
         start = se3.apply(se3.screw_at(transforms[k], -time), learned.gaussians.means[rows].double())
         transforms[k] = constrain(kind, transforms[k], start.mean(0))
-    options = {"backend": backend, "device": device}
+    options: dict[str, Any] = {"backend": backend, "device": device}
     level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
     twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
@@ -240,7 +240,9 @@ def settle_labels(
     draws the twin for what is in drawers.
     """
     fuller = round(twin.canonical_time)  # the state that shows more
-    T = torch.stack([torch.eye(4, dtype=torch.float64)] + [p.joint.transform for p in twin.parts[1:]])
+    T = torch.stack(
+        [torch.eye(4, dtype=torch.float64)] + [p.joint.transform for p in twin.parts[1:] if p.joint is not None]
+    )
     away, tau = se3.inverse(T) if fuller else T, config.polish.free_static or 0.02
 
     def without_islands(labels: Tensor, held: Tensor | None = None) -> Tensor:

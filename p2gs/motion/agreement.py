@@ -117,5 +117,5 @@ class ShownPixels:
             out = self.body.render(
                 g.means, self.body.quats, g.sh, camera, torch.zeros(3), self.backend, features=self.shown
             )
-            self.drawn[view, level] = (out.features[..., 0] + 1 - out.alpha.reshape(out.features.shape[:2])).clamp(0, 1)
+            self.drawn[view, level] = (out.painted[..., 0] + 1 - out.alpha.reshape(out.painted.shape[:2])).clamp(0, 1)
         return self.drawn[view, level]

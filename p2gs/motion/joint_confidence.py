@@ -202,10 +202,10 @@ class CrossViews:
             return self.body.render(means, quats, sh, camera, self.background, self.backend).colour.cpu(), None
         onehot = torch.nn.functional.one_hot(self.body.labels, parts).float()
         first = self.body.render(means, quats, sh, camera, self.background, self.backend, features=onehot[:, :16])
-        shares = [first.features]
+        shares = [first.painted]
         for columns in onehot[:, 16:].split(16, 1) if parts > 16 else ():
             shares.append(
-                self.body.render(means, quats, sh, camera, self.background, self.backend, features=columns).features
+                self.body.render(means, quats, sh, camera, self.background, self.backend, features=columns).painted
             )
         return first.colour.cpu(), torch.cat(shares, -1).cpu()
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from p2gs.ops import se3
 from p2gs.types import ArticulatedObject, Joint, Part
@@ -152,7 +152,7 @@ def extend_ranges(obj: ArticulatedObject, min_opacity: float = 0.5) -> list[Part
             out.append(part)
             continue
         others = [Obstacles.of(np.concatenate([x for k, x in at[t].items() if k != part.id])) for t in (0.0, 1.0)]
-        limits = extended_limits(part.joint, at[0.0][part.id], *others, farthest)
+        limits = extended_limits(part.joint, at[0.0][part.id], others[0], others[1], farthest)
         lo, hi = min(limits[0], part.joint.limits[0]), max(limits[1], part.joint.limits[1])
         out.append(replace(part, joint=replace(part.joint, limits=(lo, hi))))
     return out

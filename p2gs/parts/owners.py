@@ -37,8 +37,7 @@ def label_maps(g: GaussianTensors, labels: Tensor, count: int, stack: DepthStack
     g, maps = g.to(device), torch.zeros(stack.depth.shape, dtype=torch.int64)
     for out, camera in zip(maps, stack.cameras, strict=True):
         shares = [
-            render_gaussians(g, camera.to(device), features=c.to(device), backend=backend).features.cpu()
-            for c in chunks
+            render_gaussians(g, camera.to(device), features=c.to(device), backend=backend).painted.cpu() for c in chunks
         ]
         share = torch.cat(shares, -1)
         out[: camera.height, : camera.width] = likeliest(share.flatten(0, 1)).reshape(share.shape[:2])

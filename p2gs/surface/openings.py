@@ -132,7 +132,7 @@ class OneState:
             shot = self.views.get(i, self.level, torch.zeros(3))
             out = self.render(self.g, shot.camera, torch.zeros(3), lids)
             depth = (out.expected_depth if out.median_depth is None else out.median_depth).cpu()
-            y, x = ((out.features[..., 0].cpu() > 0.5) & (shot.alpha > 0.9) & (depth > 0)).nonzero().unbind(1)
+            y, x = ((out.painted[..., 0].cpu() > 0.5) & (shot.alpha > 0.9) & (depth > 0)).nonzero().unbind(1)
             K, W = shot.camera.K.double(), shot.camera.viewmat.double()
             ray = torch.stack(
                 [(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], torch.ones(len(x), dtype=torch.float64)],
@@ -197,7 +197,7 @@ class OneState:
         onehot = torch.zeros(len(self.g), self.count)
         onehot[self.rows, self.patch] = 1
         chunks = onehot.split(MAX_FEATURES, 1)
-        weight = [torch.cat([self.render(self.g, s.camera, grey, c).features.cpu() for c in chunks], -1) for s in shots]
+        weight = [torch.cat([self.render(self.g, s.camera, grey, c).painted.cpu() for c in chunks], -1) for s in shots]
         pixels = [w.sum(-1) > 0.01 for w in weight]
         weight = torch.cat(
             [w[p] for w, p in zip(weight, pixels, strict=True)]

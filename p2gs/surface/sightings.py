@@ -56,7 +56,7 @@ def look(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera, nea
     onehot = torch.nn.functional.one_hot(part_index, parts).float()
     out = draw(g, camera, 0.0, features=onehot[:, :MAX_FEATURES])
     more = onehot[:, MAX_FEATURES:].split(MAX_FEATURES, 1) if parts > MAX_FEATURES else ()
-    shares = [out.features] + [draw(g, camera, 0.0, features=c).features for c in more]
+    shares = [out.painted] + [draw(g, camera, 0.0, features=c).painted for c in more]
     median = out.expected_depth if out.median_depth is None else out.median_depth  # gsplat gives none
     depth, spread = surface_depth(g, camera)
     solid = (out.alpha > 0.5) & (median > 0)

@@ -47,7 +47,7 @@ def surface_depth(g: GaussianTensors, camera: Camera) -> tuple[Tensor, Tensor]:
     n = normal @ rotation.T
     pairs = torch.stack([n[:, i] * n[:, j] for i, j in PAIRS], 1)
     out = draw(g, camera, 0.0, features=torch.cat([n, offset, pairs, n * offset, offset**2], 1))
-    mean = out.features / out.alpha.clamp_min(1e-6)[..., None]
+    mean = out.painted / out.alpha.clamp_min(1e-6)[..., None]
     rays = camera_rays(camera).to(mean)
     origin = rotation @ centre + camera.viewmat[:3, 3].to(mean)
     N, slope = mean[..., :3], (mean[..., :3] * rays).sum(-1)

@@ -123,7 +123,7 @@ def animated_glb(asset: Asset, buffer: Buffer, meshes: list[dict], document: dic
 
 
 def _material(name: str, texture: int | None = None) -> dict:
-    surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+    surface: dict = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
     if texture is not None:
         surface["baseColorTexture"] = {"index": texture}
     return {"name": name, "doubleSided": True, "pbrMetallicRoughness": surface}

@@ -43,7 +43,7 @@ def write_mjcf(asset: Asset, out: Path) -> Path:
     actuator = ET.SubElement(root, "actuator")
     for link in asset.moving:
         _body(base, link)
-        reach = numbers((-link.joint.effort, link.joint.effort))
+        reach = numbers((-link.hinge.effort, link.hinge.effort))
         ET.SubElement(
             actuator, "motor", name=f"motor_{link.part}", joint=f"joint_{link.part}", gear="1", ctrlrange=reach
         )

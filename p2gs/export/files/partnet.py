@@ -49,7 +49,7 @@ def write_partnet(asset: Asset, out: Path, meta: Mapping[str, object]) -> list[P
         if link.joint is None:
             fixed_joint(robot, f"joint_{i}", "base", root, UPRIGHT)
         else:
-            add_joint(robot, link.joint, f"joint_{i}", root, f"link_{i}")
+            add_joint(robot, link.hinge, f"joint_{i}", root, f"link_{i}")
     written = [write_xml(robot, out / "mobility.urdf")]
     points = np.concatenate([link.visual.vertices + link.origin for link in asset.links])
     box = {"min": points.min(0).tolist(), "max": points.max(0).tolist()}

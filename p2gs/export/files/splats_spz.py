@@ -27,10 +27,10 @@ COLOUR = 0.15  # share of a byte's range for one unit of the constant coefficien
 
 def write_spz(asset: Asset, out: Path) -> Path:
     """OUT/splats.spz, of all parts."""
-    links = [link for link in asset.links if link.splats is not None]
     moved = [
         link.splats.placed(link.splats.means + torch.from_numpy(link.origin).float(), link.splats.quats)
-        for link in links
+        for link in asset.links
+        if link.splats is not None
     ]
     path = out / "splats.spz"
     path.write_bytes(spz_bytes(GaussianTensors.cat(moved)))

@@ -38,7 +38,7 @@ def write_urdf(asset: Asset, out: Path, mujoco: bool = True) -> Path:
     for link in asset.links:
         _link(robot, link)
     for link in asset.moving:
-        add_joint(robot, link.joint, f"joint_{link.part}", asset.links[0].name, link.name)
+        add_joint(robot, link.hinge, f"joint_{link.part}", asset.links[0].name, link.name)
     path = out / "twin.urdf"
     return write_xml(robot, path)
 

@@ -199,7 +199,7 @@ def _mesh(name: str, vertices: np.ndarray, faces: np.ndarray, extra: list[str], 
 
 
 def _joint(link: Link, base: str) -> list[str]:
-    h = link.joint
+    h = link.hinge
     kind = "Revolute" if h.type == "revolute" else "Prismatic"
     lo, hi = np.degrees([h.lower, h.upper]) if kind == "Revolute" else (h.lower, h.upper)
     turn = _tuple(x_to(h))

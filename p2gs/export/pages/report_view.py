@@ -27,7 +27,7 @@ def view_section(run_dir: Path, obj: ArticulatedObject) -> str:
 
     asset = load_asset(run_dir, up="y", max_faces=PAGE_FACES, solid=False, splats=True)
     sliders = [
-        f'<label><span>{chip(link.part)}{link.part} {link.joint.type}</span><input type="range" min="0" max="1" '
+        f'<label><span>{chip(link.part)}{link.part} {link.hinge.type}</span><input type="range" min="0" max="1" '
         'step="0.005" value="0" '
         f'data-part="{link.part}" aria-label="joint {link.part}"><output>0</output></label>'
         for link in asset.moving

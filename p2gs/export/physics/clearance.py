@@ -30,8 +30,15 @@ class Body:
 
     name: str
     pieces: list[Piece]
-    hinge: Optional[Hinge]
+    joint: Optional[Hinge]
     before: float  # volume of the pieces when clearing began
+
+    @property
+    def hinge(self) -> Hinge:
+        """The joint of a body that moves. Raises ValueError for the base."""
+        if self.joint is None:
+            raise ValueError(f"the body '{self.name}' has no joint")
+        return self.joint
 
 
 @dataclass(frozen=True)
@@ -56,21 +63,21 @@ def clear_links(links: list[Link]) -> Cleared:
     points = np.concatenate([p.vertices for b in solid for p in b.pieces])
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     gap, blocking = GAP * diagonal, []
-    for a in (b for b in solid if b.hinge is not None):
+    for a in (b for b in solid if b.joint is not None):
         steps = sweep_values(a, gap)
         for b in solid:
             if b is a:
                 continue
-            if b.hinge is None:
+            if b.joint is None:
                 _free(a, b, steps, np.eye(4), gap, diagonal)
                 continue
             # both recorded states first: they hold whatever stands in the way later
             for value in (0.0, b.hinge.motion):
                 own = 0.0 if value == 0.0 else a.hinge.motion
                 _free(a, b, np.array([own]), joint_motion(b.hinge, value), gap, diagonal)
-    for a in (b for b in solid if b.hinge is not None):
+    for a in (b for b in solid if b.joint is not None):
         steps = sweep_values(a, gap)
-        for b in (b for b in solid if b is not a and b.hinge is not None):
+        for b in (b for b in solid if b is not a and b.joint is not None):
             poses = [joint_motion(b.hinge, v) for v in (0.0, b.hinge.motion)]
             depths = [_depth(a, b, steps, pose, gap) for pose in poses]
             deep = [d > SHALLOW * diagonal for d in depths]

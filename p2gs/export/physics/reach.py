@@ -27,13 +27,13 @@ def extend_links(links: list[Link]) -> list[Link]:
     margin = 0.5 * GAP * float(np.linalg.norm(np.ptp(points, axis=0)))
     out = list(links)
     for i, a in enumerate(bodies):
-        if a.hinge is None or not a.pieces:
+        if a.joint is None or not a.pieces:
             continue
         ends = [a.hinge.lower, a.hinge.upper]
         onward = 1 if a.hinge.motion >= 0 else -1
         for state, direction in ((0.0, -onward), (1.0, onward)):
             others = [
-                (b, np.eye(4) if b.hinge is None else joint_motion(b.hinge, state * b.hinge.motion))
+                (b, np.eye(4) if b.joint is None else joint_motion(b.hinge, state * b.hinge.motion))
                 for b in bodies
                 if b is not a
             ]

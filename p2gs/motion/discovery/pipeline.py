@@ -8,7 +8,7 @@ from typing import Callable, Optional
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from p2gs.motion.discovery.amounts import parted

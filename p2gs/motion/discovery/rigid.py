@@ -37,7 +37,7 @@ class Motions:
     axis: Tensor
     centre: Tensor
     amount: Tensor
-    thick: Tensor | None = None
+    thick: Tensor = None  # pyright: ignore[reportAssignmentType]  (zeros, once it is made)
 
     def __post_init__(self) -> None:
         if self.thick is None:

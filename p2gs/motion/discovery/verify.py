@@ -4,7 +4,7 @@ shows there."""
 from __future__ import annotations
 
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from p2gs.motion.discovery.fields import Landing
