@@ -18,6 +18,7 @@ from p2gs.data.generated.textures import Texture
 from p2gs.data.ground_truth import load_ground_truth
 from p2gs.data.render.asset import euler, rotation
 from p2gs.data.render.scene import PosedAsset, RenderOptions, Span, cameras_of, parse_spans, read_asset, render_scene
+from p2gs.data.render.shapes import mesh_shapes
 from p2gs.data.render.tracer import Tracer
 from p2gs.types import UserError
 
@@ -175,6 +176,52 @@ def test_cameras_of_another_scene_and_the_same_pixels_again(urdf, tmp_path):
     for a, b in zip(*pictures, strict=True):
         one, two = (raw_pixels(p) for p in (a, b))
         assert np.abs(one.astype(int) - two.astype(int)).mean() < 0.5  # cameras were written with a few digits
+
+
+@pytest.fixture
+def uneven(tmp_path):
+    """A scene whose cameras have a focal length and a centre of their own each."""
+    toy = tmp_path / "toy.urdf"
+    toy.write_text(URDF)
+    root = tmp_path / "uneven"
+    words = ["data", "render", str(toy), str(root), "--joints", SPANS, "--size", "40", "--views", "3"]
+    assert p2gs([*words, "--test_views", "1", "--samples", "1"]) == 0
+    for path in root.glob("transforms_*_*.json"):
+        meta = json.loads(path.read_text())
+        for k, frame in enumerate(meta["frames"]):
+            frame |= {"fl_x": 60.0 + k, "fl_y": 61.0, "cx": 15.0 + 3 * k, "cy": 24.0}
+        path.write_text(json.dumps(meta))
+    return root
+
+
+def test_cameras_with_intrinsics_of_their_own_are_written_so(urdf, uneven, tmp_path):
+    words = ["data", "render", str(urdf), str(tmp_path / "out"), "--joints", SPANS, "--cameras", str(uneven)]
+    assert p2gs([*words, "--samples", "1"]) == 0
+    pairs = [DATASETS["artgs"](str(root)).raw_scene().views for root in (uneven, tmp_path / "out")]
+    for a, b in zip(*pairs, strict=True):
+        torch.testing.assert_close(a.camera.K, b.camera.K)
+
+
+@pytest.mark.parametrize("format", ["paris", "dta"])
+def test_a_layout_without_room_for_them_refuses(urdf, uneven, tmp_path, format, capsys):
+    words = ["data", "render", str(urdf), str(tmp_path / "out"), "--joints", SPANS, "--cameras", str(uneven)]
+    assert p2gs([*words, "--samples", "1", "--format", format]) == 2
+    assert "holds one focal length and centre" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_colours_of_vertices_are_kept(tmp_path):
+    import trimesh
+
+    cube = trimesh.creation.box((1, 1, 1))
+    cube.visual.vertex_colors = np.where(cube.vertices[:, :1] > 0, [[250, 10, 10, 255]], [[10, 10, 250, 255]])
+    cube.export(tmp_path / "cube.ply")
+    shape = mesh_shapes(tmp_path / "cube.ply", (1, 1, 1), np.eye(4), np.array([0, 1.0, 0]))[0]
+    assert shape.image is not None and shape.uv is not None
+    side, height = shape.image.shape[1], shape.image.shape[0]
+    uv = shape.uv[shape.faces].mean(1)
+    texels = shape.image[((1 - uv[:, 1]) * height).astype(int), (uv[:, 0] * side).astype(int)]
+    middle = shape.vertices[shape.faces][..., 0].mean(1)
+    assert (texels[middle > 0.49, 0] > 200).all() and (texels[middle < -0.49, 2] > 200).all()
 
 
 def raw_pixels(path):

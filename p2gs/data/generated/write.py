@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Callable, Literal, Optional, Protocol, Sequence
 
 import numpy as np
+import torch
 
 from p2gs.data.frames import STATES
 from p2gs.data.generated.articulated import SyntheticJoint, SyntheticObject, concatenate
@@ -87,10 +88,30 @@ def write_ground_truth(obj: Drawn, folder: Path) -> None:
             path.write_bytes(trimesh.Trimesh(v, f, process=False).export(file_type="ply"))
 
 
+def shared_K(views: Sequence[View], layout: str) -> np.ndarray:
+    """The intrinsics [3, 3] of views whose layout has room for one K. Raises UserError where they differ."""
+    Ks = np.stack([v.camera.K.double().numpy() for v in views])
+    if np.abs(Ks - Ks[0]).max() > 1e-3:  # pixels
+        raise UserError(f"the {layout} layout holds one focal length and centre, and these cameras differ; take artgs")
+    return Ks[0]
+
+
+def _intrinsics(view: View) -> dict[str, float]:
+    K = view.camera.K.double().numpy()
+    return {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+
+
 def _write_artgs(scene: TwoStateScene, root: Path, depth: bool) -> Path:
     camera = scene.views[0].camera
     angles = (2 * np.arctan(0.5 * n / float(camera.K[i, i])) for i, n in enumerate((camera.width, camera.height)))
     head = dict(zip(("camera_angle_x", "camera_angle_y"), map(float, angles), strict=True))
+    # ArtGS itself has one field of view with its centre in the middle; what differs is written with each frame
+    centred = bool((camera.K[:2, 2] - torch.tensor([camera.width / 2, camera.height / 2])).abs().max() < 1e-3)
+    plain = centred and all(
+        (v.camera.width, v.camera.height) == (camera.width, camera.height)
+        and torch.allclose(v.camera.K, camera.K, rtol=0, atol=1e-3)
+        for v in scene.views
+    )
     _json(root / "transforms_train.json", {**head, "frames": []})  # ArtGS only tests that it is there
     for s, state in enumerate(STATES):
         for split in ("train", "test"):
@@ -100,14 +121,16 @@ def _write_artgs(scene: TwoStateScene, root: Path, depth: bool) -> Path:
                 _png(root / path, _bgra(v))
                 if depth:
                     _png(root / path.replace("rgba", "depth"), _millimetres(v))
-                frames.append({"file_path": path, "time": float(s), "transform_matrix": opengl_c2w(v)})
+                frame = {"file_path": path, "time": float(s), "transform_matrix": opengl_c2w(v)}
+                frames.append(frame if plain else frame | _intrinsics(v))
             _json(root / f"transforms_{split}_{state}.json", {**head, "frames": frames})
     return root / "gt"
 
 
 def _write_dta(scene: TwoStateScene, root: Path, depth: bool) -> Path:
-    lines = []
-    for v in scene.select(split="train"):
+    views, lines = scene.select(split="train"), []
+    K = shared_K(views, "dta")
+    for v in views:
         name = f"{v.state}_{v.name}"
         _png(root / "color_segmented" / f"{name}.png", _bgra(v)[..., :3] * (v.alpha.numpy() > 127)[..., None])
         _png(root / "mask" / f"{name}.png", np.where(v.alpha.numpy() > 127, 255, 0).astype(np.uint8))
@@ -116,15 +139,16 @@ def _write_dta(scene: TwoStateScene, root: Path, depth: bool) -> Path:
         numbers = ", ".join(repr(x) for row in opengl_c2w(v) for x in row)
         lines.append(f"frame_{name}:\n  cam_in_ob: [{numbers}]\n  time: {v.state}\n")
     (root / "init_keyframes.yml").write_text("".join(lines))
-    np.savetxt(root / "cam_K.txt", scene.views[0].camera.K.double().numpy())
+    np.savetxt(root / "cam_K.txt", K)
     return root / "gt"
 
 
 def _write_paris(scene: TwoStateScene, root: Path, depth: bool) -> Path:
     for s, state in enumerate(STATES):
         for split in ("train", "test"):
-            cameras: dict = {"K": scene.views[0].camera.K.double().tolist()}
-            for v in scene.select(s, split):
+            views = scene.select(s, split)
+            cameras: dict = {"K": shared_K(views or scene.select(s), "paris").tolist()}
+            for v in views:
                 _png(root / "load" / state / split / f"{v.name}.png", _bgra(v))
                 cameras[v.name] = opengl_c2w(v)
             _json(root / "load" / state / f"camera_{split}.json", cameras)

@@ -33,7 +33,8 @@ class AssetJoint:
     """A joint from link ``parent`` to link ``child``.
 
     placed [4, 4]: the joint's frame in the parent's.  axis [3]: unit, in the joint's frame.  back [4, 4]: the child's
-    frame in the joint's, at zero.  limits: (least, most) in radians or lengths, None where there are none.
+    frame in the joint's, at ``zero``: the value at which nothing is turned or shifted (MJCF's ref).  limits: (least,
+    most) in radians or lengths, None where there are none.
     """
 
     name: str
@@ -44,20 +45,21 @@ class AssetJoint:
     axis: np.ndarray
     limits: Optional[tuple[float, float]] = None
     back: np.ndarray = field(default_factory=lambda: np.eye(4))
+    zero: float = 0.0
 
     def motion(self, value: float) -> np.ndarray:
         """[4, 4] child -> parent at a value in radians or lengths."""
         T = np.eye(4)
         if self.type == "prismatic":
-            T[:3, 3] = value * self.axis
+            T[:3, 3] = (value - self.zero) * self.axis
         elif self.type == "revolute":
-            T[:3, :3] = rotation(self.axis, value)
+            T[:3, :3] = rotation(self.axis, value - self.zero)
         return self.placed @ T @ self.back
 
     @property
     def rest(self) -> float:
-        """Zero, or the limit next to it."""
-        return 0.0 if self.limits is None else min(max(0.0, self.limits[0]), self.limits[1])
+        """``zero``, or the limit next to it."""
+        return self.zero if self.limits is None else min(max(self.zero, self.limits[0]), self.limits[1])
 
 
 @dataclass(frozen=True)

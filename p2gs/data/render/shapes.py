@@ -58,12 +58,24 @@ def _shape(mesh: Any, matrix: np.ndarray, colour: Optional[np.ndarray]) -> Shape
     if image is not None and uv is not None and len(uv) == len(vertices):
         return Shape(vertices, faces, GREY, image, np.asarray(uv, np.float64))
     if material is not None:
-        own = np.asarray(material.main_color, float)[:3] / 255
-    elif colour is not None or visual.kind is None:
-        own = GREY if colour is None else colour
-    else:
-        own = np.asarray(visual.main_color, float)[:3] / 255
-    return Shape(vertices, faces, own)
+        return Shape(vertices, faces, np.asarray(material.main_color, float)[:3] / 255)
+    if visual.kind in ("vertex", "face"):
+        return _painted(vertices, faces, np.asarray(visual.face_colors)[:, :3])
+    return Shape(vertices, faces, GREY if colour is None else colour)
+
+
+def _painted(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> Shape:
+    """Triangles of a colour each, colours [F, 3] uint8: a texture that has a texel for each colour."""
+    palette, which = np.unique(colours, axis=0, return_inverse=True)
+    if len(palette) == 1:
+        return Shape(vertices, faces, palette[0] / 255)
+    side = int(np.ceil(len(palette) ** 0.5))
+    image = np.zeros((side * side, 3), np.uint8)
+    image[: len(palette)] = palette
+    row, column = np.divmod(which.reshape(-1), side)
+    uv = np.stack([(column + 0.5) / side, 1 - (row + 0.5) / side], axis=1)
+    corners = vertices[faces].reshape(-1, 3)
+    return Shape(corners, np.arange(len(corners)).reshape(-1, 3), GREY, image.reshape(side, side, 3), uv.repeat(3, 0))
 
 
 def _image(material: Any) -> Optional[np.ndarray]:
