@@ -20,6 +20,7 @@ from p2gs.motion.refine_motions import Judge, leave_false_minima, refine, single
 from p2gs.motion.screw_polish import PolishConfig, photometric_cost
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
+from p2gs.parts.askew import lay_axes
 from p2gs.parts.islands import settle_twin_islands
 from p2gs.surface.contents import in_trays
 from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
@@ -36,17 +37,19 @@ class FinishConfig:
     its own surface that are tried after it (internal units; [] = none). tune: then the Gaussians once more, with the
     screws frozen. min_mass: a slot with a smaller share of the solid Gaussians vanishes. min_motion: likewise one that
     moves its points by less (internal units).
-    prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a slide.
-    clean_neighbours: labels are the majority among this many neighbours at canonical time (0 = as learned). islands:
-    pieces of a part smaller than this share of its largest go to what they touch (0 = off). trays: views of a state by
-    which drawers' trays are found, what is in or on which goes with the drawer (0 = off). exports: simulator formats
-    written at the end of a fit, with meshes and report (empty: neither; `p2gs export` makes them later). extend_range:
-    joint limits go on beyond the observed motion until the part touches another one (half a turn, the object's diagonal
-    at most); off: they are the observed motion. unclear: Gaussians whose majority exceeds the rest by less are shown as
-    such in the diagnosis (0..1). complete: meshes have guesses for what no camera saw (undersides, drawers' trays,
-    hidden middles). whole: the mesh of the whole is its parts "joined", or a surface of its own, made "separate"ly from
-    each state's views, as PARIS, DTA and ArtGS have it. cluster: for meshes a moving part keeps only its largest DBSCAN
-    cluster of Gaussians, this the radius (input units; 0 = off; ArtGS cleans real scans so, with 0.05).
+    askew: share of the image loss that an axis which is askew to the object's directions must save against one
+    along them. prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a slide.
+    clean_neighbours: labels are the majority among this many neighbours at canonical time (0 = as learned).
+    islands: pieces of a part smaller than this share of its largest go to what they touch (0 = off). trays: views
+    of a state by which drawers' trays are found, what is in or on which goes with the drawer (0 = off). exports:
+    simulator formats written at the end of a fit, with meshes and report (empty: neither; `p2gs export` makes them
+    later). extend_range: joint limits go on beyond the observed motion until the part touches another one (half a
+    turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians whose majority
+    exceeds the rest by less are shown as such in the diagnosis (0..1). complete: meshes have guesses for what no
+    camera saw (undersides, drawers' trays, hidden middles). whole: the mesh of the whole is its parts "joined", or
+    a surface of its own, made "separate"ly from each state's views, as PARIS, DTA and ArtGS have it. cluster: for
+    meshes a moving part keeps only its largest DBSCAN cluster of Gaussians, this the radius (input units; 0 = off;
+    ArtGS cleans real scans so, with 0.05).
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0))
@@ -54,6 +57,7 @@ class FinishConfig:
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     min_mass: float = 0.002
     min_motion: float = 0.01
+    askew: float = 0.01
     prismatic_below: float = 5.0
     clean_neighbours: int = 8
     islands: float = 0.25
@@ -73,8 +77,8 @@ class FinishRecord:
     labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the
     polish (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
     start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.
-    slots: the learned slot of each part.  contents: Gaussians that became a drawer's because they are on or in its
-    tray.
+    laid: axes that were tried along the object's directions (``lay_axes``).  slots: the learned slot of each part.
+    contents: Gaussians that became a drawer's because they are on or in its tray.
     """
 
     labels: list[Tensor]
@@ -86,6 +90,7 @@ class FinishRecord:
     evidence: list[JointEvidence] = field(default_factory=list)
     slots: list[int] = field(default_factory=list)
     contents: int = 0
+    laid: list[dict] = field(default_factory=list)
 
 
 def majority(labels: Tensor, neighbours: Tensor, weights: Tensor, parts: int) -> tuple[Tensor, Tensor]:
@@ -212,9 +217,9 @@ def finish(
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         refined = refine(states, motions, views, config.polish, stacks, **options)
-        refined, _ = leave_false_minima(
-            Judge(None, states, views, config.polish, stacks, **options), refined, config.survey
-        )
+        judge = Judge(None, states, views, config.polish, stacks, **options)
+        refined, _ = leave_false_minima(judge, refined, config.survey)
+        refined, record.laid = lay_axes(judge, refined, config.askew)
         transforms = refined.transforms
         record.after = transforms
         record.polish = single_ways(states, refined, views, config.polish, stacks, **options)

@@ -17,6 +17,7 @@ from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.models.stage import Stage, register_phase
 from p2gs.motion.discovery import Discovery, StateEvidence, discover, relabel
 from p2gs.motion.refine_motions import Judge, leave_false_minima
+from p2gs.parts.askew import lay_axes
 from p2gs.parts.bodies import Surfaces, one_part_a_body
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import join_twins, settle_types, simplify
@@ -56,6 +57,7 @@ def find_part_motions(
     if joined:
         motions = judge.refine(motions)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
+    motions, laid = lay_axes(judge, motions, config.askew)
     for part in unfounded:
         say(
             f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence "
@@ -71,6 +73,7 @@ def find_part_motions(
         "rounds": rounds,
         "joined": joined,
         "unfounded": unfounded,
+        "laid": laid,
         **_plain(found.diagnostics),
     }
     return motions

@@ -59,13 +59,15 @@ def refine(
     *,
     seed: int,
     backend: str,
+    axes: Tensor | None = None,
     device="cpu",
 ) -> PartMotions:
-    """Photometric refinement of all motions, both directions at once."""
+    """Photometric refinement of all motions, both directions at once. axes: as in ``polish``."""
     if config.steps <= 0 or len(motions) == 0:
         return motions
     sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
-    result, _ = polish(sides, motions.transforms, motions.types, config, seed=seed, backend=backend, device=device)
+    options = {"seed": seed, "axes": axes, "backend": backend, "device": device}
+    result, _ = polish(sides, motions.transforms, motions.types, config, **options)
     return replace(motions, transforms=result)
 
 
@@ -180,9 +182,9 @@ class Judge:
         cost = self.cost(motions)
         return math.log(max(cost, 1e-9)) + self.surfaces(motions), cost
 
-    def refine(self, motions: PartMotions) -> PartMotions:
-        """Refined by the photographs, whether or not the energy falls."""
-        options = {"seed": self.seed, "backend": self.backend, "device": self.device}
+    def refine(self, motions: PartMotions, axes: Tensor | None = None) -> PartMotions:
+        """Refined by the photographs, whether or not the energy falls. axes: as in ``polish``."""
+        options = {"seed": self.seed, "axes": axes, "backend": self.backend, "device": self.device}
         return refine(self.states, motions, self.views, self.config, self.stacks, **options)
 
     def improved(self, motions: PartMotions) -> tuple[float, float, PartMotions]:

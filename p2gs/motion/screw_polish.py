@@ -98,6 +98,16 @@ class MovedGaussians:
         )
 
 
+def along_axes(kinds: list[str], axes: Tensor, step: Tensor) -> Tensor:
+    """Tangent steps [K, 6] without what would tilt joints whose axes [K, 3] are held (NaN: free): of a turn the
+    rotation about its axis and the shift across it stay, of a slide the shift along it."""
+    held = ~axes.isnan().any(1, keepdim=True)
+    d = axes.nan_to_num()
+    rotation, shift = ((x * d).sum(1, keepdim=True) * d for x in (step[:, :3], step[:, 3:]))
+    slides = torch.tensor([kind == "prismatic" for kind in kinds])[:, None]
+    return torch.where(held, torch.cat([rotation, torch.where(slides, shift, step[:, 3:] - shift)], 1), step)
+
+
 def allowed_step(kinds: list[str], T: Tensor, centre: Tensor, radius: Tensor, step: Tensor) -> Tensor:
     """Project tangent steps [K, 6] = (rotation * radius, translation) at ``centre`` [K, 3] onto the motions of the
     joints' types.
@@ -151,6 +161,7 @@ def polish(
     config: PolishConfig,
     *,
     seed: int,
+    axes: Tensor | None = None,
     backend: str = "auto",
     device: torch.device | str = "cpu",
 ) -> tuple[Tensor, list[float]]:
@@ -160,7 +171,8 @@ def polish(
     Steps look at the sides in turn and share one descent: where one state's surfaces are wrong its own optimum is wrong
     too, and a mean of two optima with it; the sum of both losses has its minimum near the truth. A backward step of B =
     T^-1 about a point a is the forward one about T a with its vectors turned by -R.
-    types: "revolute" | "prismatic" | "free" per movable part. ``config.steps`` are taken per side.
+    types: "revolute" | "prismatic" | "free" per movable part.  axes [K-1, 3]: directions that joints keep, which those
+    of ``transforms`` have (NaN: free; None: all are).  ``config.steps`` are taken per side.
     Returns (transforms float64, each side's mean loss over the last tenth).
     """
     transforms = transforms.double().clone()
@@ -218,6 +230,7 @@ def polish(
         direction = first / (1 - 0.9**seen) / ((second / (1 - 0.99**seen)).sqrt() + 1e-12)
         rate = config.rate * exponential(1.0, 0.01, fraction)
         delta = allowed_step(types, transforms, centre, radius, -rate * direction)
+        delta = delta if axes is None else along_axes(types, axes, delta)
         transforms = torch.where(on[..., None], apply_step(transforms, centre, radius[:, None], delta), transforms)
         transforms[slides, :3, :3] = torch.eye(3, dtype=torch.float64)
     for k, kind in enumerate(types):
@@ -260,7 +273,8 @@ def photometric_cost(
     device: torch.device | str = "cpu",
 ) -> float:
     """Mean image loss of the moved Gaussians over ``count`` views spread over the training set: lower explains the
-    images better.
+    images better. Before a background unlike the object, so that an outline in the wrong place costs as much on a grey
+    object as on any.
 
     shown: weight of each pixel, as in ``Side``; what a pixel lacks of 1 costs ``hidden`` instead (None: all count
     alike).
@@ -269,8 +283,8 @@ def photometric_cost(
     means, quats, sh = body.moved(transforms)
     total, picked = 0.0, views.spread(count)
     for index in picked:
-        background = torch.full((3,), 0.5)
         size = views.levels.index(level)
+        background = views.contrast(index, size)
         shot = views.get(index, size, background)
         colour, target = (
             body.render(means, quats, sh, shot.camera, background, backend).colour,

@@ -29,6 +29,8 @@ class PartMotionsConfig:
     again amid the others, refined, and taken where the energy falls.
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to
     nothing of it.
+    askew: share of the image loss that an axis must save which is askew to the directions that the object has, against
+    one along them.
     """
 
     evidence_size: int = 200
@@ -44,5 +46,6 @@ class PartMotionsConfig:
     rounds: int = 2
     reconsider: bool = True
     min_confidence: float = 0.02
+    askew: float = 0.01
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))

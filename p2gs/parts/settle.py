@@ -69,7 +69,7 @@ def _with_part(found: Discovery, states, motions: PartMotions, part: int | None)
     """The motions with another one for ``part`` (None: with one more), labels chosen anew."""
     k, out = len(motions) if part is None else part, []
     for transform, kind in instead_of(found, motions.transforms, motions.types, part):
-        out.append(_relabelled(found, states, motions.with_motion(k, kind, transform)))
+        out.append(relabelled(found, states, motions.with_motion(k, kind, transform)))
     return out
 
 
@@ -78,11 +78,11 @@ def _proposed(found: Discovery, states, motions: PartMotions, proposals: list[tu
     out = []
     for k, transforms, types in proposals:
         tried = replace(motions, types=types, transforms=transforms, confidence=torch.zeros(len(types)))
-        out.append((k, _relabelled(found, states, tried)))
+        out.append((k, relabelled(found, states, tried)))
     return out
 
 
-def _relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:
+def relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:
     """The same motions with labels chosen anew, and discovery's confidence in them under these."""
     explanation = relabel(found, motions.transforms, motions.types)
     labels, margin = label_gaussians(explanation, states)
@@ -104,7 +104,7 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
         # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from
         # here on
         for name in ("kept", "anew"):
-            tried = _relabelled(found, states, motions) if name == "anew" else motions
+            tried = relabelled(found, states, motions) if name == "anew" else motions
             labels, count = settle_islands(
                 [s.gaussians for s in states], tried.labels, tried.transforms, config.islands
             )
@@ -141,5 +141,5 @@ def drop_unfounded(judge: Judge, motions: PartMotions, least: float) -> tuple[Pa
     while len(motions) and float(motions.confidence.min()) < least:
         k = int(motions.confidence.argmin())
         gone.append({"type": motions.types[k], "confidence": float(motions.confidence[k])})
-        motions = _relabelled(judge.found, judge.states, without_part(motions, k, 0))
+        motions = relabelled(judge.found, judge.states, without_part(motions, k, 0))
     return (judge.refine(motions) if gone else motions), gone

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,9 +14,10 @@ from boxes import both, door, drawer, shell
 from p2gs.motion.discovery.amounts import parted
 from p2gs.motion.discovery.config import DiscoveryConfig
 from p2gs.motion.discovery.finish import Explanation
+from p2gs.motion.discovery.hypotheses import Sweep
 from p2gs.motion.discovery.labels import REVEALED, Graph, Labelling, label, unary
 from p2gs.motion.discovery.pipeline import as_motions, discover, ranked, relabel, static_axes, total_score
-from p2gs.motion.discovery.problem import build_problem, evidence_masks
+from p2gs.motion.discovery.problem import build_problem, evidence_masks, resampled
 from p2gs.motion.discovery.refine import pattern_search
 from p2gs.motion.discovery.rigid import Motions
 from p2gs.motion.discovery.search import Search
@@ -263,3 +265,27 @@ def test_relabel_by_the_true_motion_labels_like_the_search():
     assert nothing.motions == [] and [p.shape[1] for p in nothing.probability] == [1, 1]
     label, _ = nothing.label_points(torch.as_tensor(start.points), torch.as_tensor(start.colours), 0)
     assert not label.any()
+
+
+def test_moved_surface_counts_alike_whichever_state_shows_it(stacked):
+    """Shut, a drawer shows next to nothing that moved, open all of its tray: the few must not outweigh the many."""
+    problem = stacked[0]
+    few = torch.zeros_like(problem.moved[0])
+    few[problem.moved[0].nonzero()[:5, 0]] = True
+    drawn = resampled(replace(problem, moved=[few, problem.moved[1]]), 0)
+    assert len(drawn.samples[0]) == 5 and sum(float(w.sum()) for w in drawn.weights) == pytest.approx(2)
+    trust = [float(t[m].mean()) for t, m in zip(problem.trust, (few, problem.moved[1]), strict=True)]
+    expected = 5 * trust[0] / (int(problem.moved[1].sum()) * trust[1])
+    assert float(drawn.weights[0].sum() / drawn.weights[1].sum()) == pytest.approx(expected, rel=0.1)
+    # a state that shows nothing is looked at where its fate is unknown
+    none = resampled(replace(problem, moved=[torch.zeros_like(few), problem.moved[1]]), 0)
+    assert len(none.samples[0]) and not problem.static[0][none.samples[0]].any()
+
+
+def test_what_arrives_on_surface_of_unknown_fate_need_not_be_answered():
+    """Three motions, two points a state. Evidence is even on surfaces of known fate, odd on unknown ones."""
+    motions = Motions(torch.zeros(3, dtype=torch.bool), torch.eye(3), torch.zeros(3, 3), torch.ones(3))
+    evidence = torch.tensor([[0, 0, 254, 254], [0, 0, 255, 255], [254, 254, 254, 254]], dtype=torch.uint8)
+    half = torch.full((2,), 0.5)
+    gain = Sweep(motions, evidence, [torch.arange(2)] * 2).gain([half, half])
+    assert gain.tolist() == pytest.approx([0.03, 1.0, 2 * 254 / 255])

@@ -82,9 +82,13 @@ def directions(problem: Problem, limit: int = 8, apart: float = 12.0) -> Tensor:
 
 
 def static_axes(problem: Problem) -> Tensor:
-    """[D, 3] directions that the surfaces of both states share which never moved, and where pairs of them cross."""
-    still = torch.cat([problem.surfels[s].normals[~problem.moved[s]] for s in (0, 1)])
-    peaks = normal_peaks(still, 3, apart=40.0, least=0.06)[0] if len(still) else torch.zeros(0, 3)
+    """``shared_directions`` of the surfaces of both states that never moved."""
+    return shared_directions(torch.cat([problem.surfels[s].normals[~problem.moved[s]] for s in (0, 1)]))
+
+
+def shared_directions(normals: Tensor) -> Tensor:
+    """[D, 3] directions that many normals [N, 3] (unit, sign-free) share, and where pairs of them cross."""
+    peaks = normal_peaks(normals, 3, apart=40.0, least=0.06)[0] if len(normals) else torch.zeros(0, 3)
     out = list(peaks)
     for i in range(len(peaks)):
         for j in range(i):
@@ -95,33 +99,39 @@ def static_axes(problem: Problem) -> Tensor:
     return torch.stack(out) if out else torch.zeros(0, 3)
 
 
-def arrival_table(landing: Landing, moved: Tensor) -> Tensor:
-    """[27 * voxels] uint8: how well a facing pattern at a coarse voxel finds a like surfel there, 0..255; never-moved
-    ones count less."""
+def arrival_table(landing: Landing, moved: Tensor, share: float = 1.0) -> Tensor:
+    """[27 * voxels] uint8: how well a facing pattern at a coarse voxel finds a like surfel there, 0..255 times
+    ``share``; never-moved ones count less. The lowest bit says that the surfel's fate is unknown."""
     centre = landing._centres(landing.coarse, landing.hc)
     near = landing.nearest.reshape(27, -1).long()
     d = (landing.surfels.points[near] - centre).norm(dim=2)
     q = (1.75 - d / landing.hc).clamp(0, 1) * (0.3 + 0.4 * (~landing.static[near]).float() + 0.3 * moved[near].float())
-    return (q * 255).to(torch.uint8).reshape(-1)
+    loose = ~(moved | landing.static)[near]
+    return (((q * share * 255).to(torch.uint8) & 0xFE) | loose.to(torch.uint8)).reshape(-1)
 
 
 @dataclass
 class Sweep:
-    """Every motion tried and its evidence [H, P0 + P1] (uint8) over a sample of the moved points of both states."""
+    """Every motion tried and its evidence [H, P0 + P1] (uint8, as in ``arrival_table``) over a sample of the moved
+    points of both states."""
 
     motions: Motions
     evidence: Tensor
     samples: list[Tensor]
 
     def gain(self, weights: list[Tensor], chunk: int = 20000) -> Tensor:
-        """Evidence of each motion, points weighted [P0], [P1] (each state's weights sum to at most 1); states must
-        agree."""
+        """Evidence of each motion, points weighted [P0], [P1] (both states' weights sum to at most 2); states must
+        agree, but for what arrives on surfaces of unknown fate."""
         n = len(weights[0])
         w = torch.zeros(n + len(weights[1]), 2)
         w[:n, 0], w[n:, 1] = weights[0] / 255, weights[1] / 255
-        g = torch.cat([self.evidence[i : i + chunk].float() @ w for i in range(0, len(self.evidence), chunk)])
-        a, b = g[:, 0], g[:, 1]
-        return torch.minimum(a, 3 * b + 0.03) + torch.minimum(b, 3 * a + 0.03)
+        known, loose = [], []
+        for i in range(0, len(self.evidence), chunk):
+            rows = self.evidence[i : i + chunk]
+            known.append((rows * (1 - rows % 2)).float() @ w)
+            loose.append((rows * (rows % 2)).float() @ w)
+        (a, b), (c, d) = torch.cat(known).T, torch.cat(loose).T
+        return torch.minimum(a, 3 * (b + d) + 0.03) + torch.minimum(b, 3 * (a + c) + 0.03) + c + d
 
 
 def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120000) -> Sweep:
@@ -132,6 +142,7 @@ def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120
     cfg, diag = problem.config, problem.scale.diag
     landings = problem.landings
     tables = [arrival_table(landings[s], problem.moved[s]) for s in (0, 1)]
+    behind = [arrival_table(landings[s], problem.moved[s], OTHER_SIDE) for s in (0, 1)]
     hc, lo, size = landings[0].hc, landings[0].lo, landings[0].coarse
     voxels = int(size.prod())
     points = [(problem.surfels[s].points[samples[s]] - lo) / hc for s in (0, 1)]
@@ -186,8 +197,8 @@ def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120
                 for s, turn in enumerate((R, R.T)):
                     p, facing = points[s] @ turn.T, normals[s] @ turn.T
                     same = look(p, facing, shifts[s], tables[1 - s])
-                    other = look(p - PLATE * facing, -facing, shifts[s], tables[1 - s])
-                    q.append(torch.maximum(same, (other.float() * OTHER_SIDE).to(torch.uint8)))
+                    other = look(p - PLATE * facing, -facing, shifts[s], behind[1 - s])
+                    q.append(torch.maximum(same, other))
                 keep_good(m, torch.cat(q, 1))
     motions = Motions.cat([m for m, _ in kept])
     evidence = torch.cat([q for _, q in kept])

@@ -18,7 +18,7 @@ from p2gs.motion.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.motion.discovery.labels import Graph, Labelling, label
 from p2gs.motion.discovery.pairs import crossed
 from p2gs.motion.discovery.pool import plausibility
-from p2gs.motion.discovery.problem import Problem, build_problem, resampled
+from p2gs.motion.discovery.problem import FEWEST, Problem, build_problem, resampled
 from p2gs.motion.discovery.result import Candidate, Discovery, FoundMotion
 from p2gs.motion.discovery.rigid import Motions, without
 from p2gs.motion.discovery.search import ExclusiveGain, Search, two_sided
@@ -61,7 +61,8 @@ def discover(
     graphs = [Graph(s.points, s.normals, s.colours) for s in problem.surfels]
     explanations: list[Explanation] = []
     search = None
-    if limit > 0 and max(map(len, problem.samples)) >= config.min_moved and min(map(len, problem.samples)) >= 3:
+    enough = max(int(m.sum()) for m in problem.moved) >= config.min_moved
+    if limit > 0 and enough and min(map(len, problem.samples)) >= FEWEST:
         axes, still = directions(problem), static_axes(problem)
         most = max(limit, config.max_parts - 1)  # a bound cuts what is found, not the search
         sets: list[Motions] = []

@@ -17,6 +17,7 @@ from p2gs.visibility.surfels import Surfels, build_surfels
 
 MARGIN = 0.28  # costs above this are no evidence for a motion
 SOFT = 0.10
+FEWEST = 3  # moved surfels of a state that can be searched: three points make a motion
 
 
 @dataclass
@@ -25,7 +26,7 @@ class Problem:
     the search looks at.
 
     trust [N] per state, 0.1..1: how credible it is that a moved surfel moved; ``weights`` [P] per state: that of the
-    samples, sum 1.
+    samples times the moved surface that each stands for, sum 2 over both states.
     """
 
     config: DiscoveryConfig
@@ -191,14 +192,22 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
 
 
 def resampled(problem: Problem, seed: int) -> Problem:
-    """The problem with moved surfels drawn anew to look at (``samples``) and their weights."""
+    """The problem with moved surfels drawn anew to look at (``samples``) and their weights: each surfel counts alike,
+    whichever state shows it.
+
+    A state that shows next to nothing that moved (a drawer's front, before which the open drawer stands in the other
+    state) is looked at where its fate is unknown.
+    """
     g = torch.Generator().manual_seed(seed)
     samples, weights = [], []
     for s in (0, 1):
         index = torch.nonzero(problem.moved[s])[:, 0]
+        if len(index) < FEWEST:
+            index = torch.nonzero(~problem.static[s])[:, 0]
         samples.append(index[spread_sample(problem.surfels[s].points[index], problem.config.samples, g)])
-        weights.append(problem.trust[s][samples[s]] / problem.trust[s][samples[s]].sum().clamp_min(1e-9))
-    return replace(problem, samples=samples, weights=weights)
+        weights.append(problem.trust[s][samples[s]] * (len(index) / max(len(samples[s]), 1)))
+    total = sum(float(w.sum()) for w in weights)
+    return replace(problem, samples=samples, weights=[2 * w / max(total, 1e-9) for w in weights])
 
 
 def spread_sample(points: Tensor, n: int, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,97 @@
+"""Directions that an object has: what many of its surfaces face, and where such facings cross. Made things have few,
+and most joints lie along one of them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from p2gs.gaussians.handover import StateGaussians
+from p2gs.motion.agreement import SOLID
+from p2gs.motion.discovery.hypotheses import shared_directions
+from p2gs.motion.discovery.rigid import perpendicular
+from p2gs.ops import se3, so3
+from p2gs.ops.knn import knn
+
+FACING = 0.99  # cosine between a point's normal and the facing of the planes that it is taken for a point of: 8 degrees
+FEWEST = 20  # points of a plane
+ROUNDS = 3  # of planes found and fitted
+
+
+def directions_of(states: list[StateGaussians], labels: list[Tensor]) -> Tensor:
+    """[D, 3] directions (float64) of the static Gaussians of both states: ``shared_directions`` of their normals, each
+    fitted to the planes that face it (``common_normal``). labels [N] of each state (0 static)."""
+    points, normals = [], []
+    for state, of in zip(states, labels, strict=True):
+        g = state.gaussians.detach()
+        still = (of == 0).cpu() & (torch.sigmoid(g.opacity_logits).cpu() > SOLID)
+        R = so3.quat_to_matrix(so3.quat_normalize(g.quats.cpu()[still]))
+        shortest = g.log_scales.cpu()[still].argmin(1)
+        normals.append(R.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0])
+        points.append(g.means.cpu()[still])
+    points, normals = torch.cat(points), torch.cat(normals)
+    found = shared_directions(normals).double()
+    if not len(found):
+        return found
+    gap = 0.5 * float(knn(points, None, 1, True)[0].median())
+    return torch.stack([common_normal(points.double(), normals.double(), d, gap) for d in found])
+
+
+def common_normal(points: Tensor, normals: Tensor, direction: Tensor, gap: float) -> Tensor:
+    """The normal [3] that the planes share which face about ``direction`` [3]: least squares over all planes at once,
+    each with an offset of its own, Geman-McClure weights for what lies off its plane.
+
+    points, normals: [N, 3].  gap: offsets farther apart than this are of two planes.  The direction itself where no
+    plane faces it.
+    """
+    points = points[(normals @ direction).abs() > FACING]
+    for _ in range(ROUNDS if len(points) >= FEWEST else 0):
+        e = torch.stack(list(perpendicular(direction)))
+        offset = points @ direction
+        order = offset.argsort()
+        plane = torch.zeros(len(order), dtype=torch.int64)
+        plane[1:] = (offset[order].diff() > gap).long().cumsum(0)
+        A, b = torch.zeros(2, 2).double(), torch.zeros(2).double()
+        for rows in order.split(torch.bincount(plane).tolist()):
+            if len(rows) >= FEWEST:
+                one, two = _tilt(points[rows] @ e.T, offset[rows])
+                A, b = A + one, b + two
+        if float(torch.linalg.matrix_rank(A)) < 2:
+            break
+        tilt = torch.linalg.solve(A, b)
+        direction = torch.nn.functional.normalize(direction - tilt @ e, dim=0)
+    return direction
+
+
+def _tilt(across: Tensor, offset: Tensor, rounds: int = 5) -> tuple[Tensor, Tensor]:
+    """Normal equations (A [2, 2], b [2]) of a plane's tilt: offset [M] against place ``across`` [M, 2], in units of the
+    residuals' spread."""
+    x, y = across - across.mean(0), offset - offset.mean()
+    weight = torch.ones_like(y)
+    A = b = torch.zeros(0)
+    for _ in range(rounds):
+        A, b = (x * weight[:, None]).T @ x, (x * weight[:, None]).T @ y
+        residual = y - x @ torch.linalg.lstsq(A, b[:, None]).solution[:, 0]
+        spread = 1.4826 * float(residual.abs().median()) + 1e-9
+        weight = 1 / (1 + (residual / (2 * spread)).square()).square()
+        A, b = A / spread**2, b / spread**2
+    return A, b
+
+
+def axis_of(kind: str, T: Tensor) -> Tensor:
+    """Direction [3] of a joint's axis, of its motion [4, 4]."""
+    return torch.nn.functional.normalize(T[:3, 3], dim=0) if kind == "prismatic" else se3.screw_parameters(T).axis
+
+
+def turned_onto(kind: str, T: Tensor, direction: Tensor, middle: Tensor) -> Tensor:
+    """The motion [4, 4] with its axis along ``direction`` [3]: as far as before, a hinge at the place of its line that
+    is nearest to ``middle`` [3], the part's at the start."""
+    axis = axis_of(kind, T)
+    d = direction * torch.sign(direction @ axis)
+    if kind == "prismatic":
+        out = torch.eye(4, dtype=T.dtype)
+        out[:3, 3] = d * (T[:3, 3] @ d)
+        return out
+    screw = se3.screw_parameters(T)
+    origin = screw.origin + axis * ((middle - screw.origin) @ axis)
+    return se3.from_screw(d, origin, screw.angle)

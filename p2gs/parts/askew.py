@@ -1,0 +1,55 @@
+"""Joints that are askew to the object: where photographs hardly tell which way a part went (a shut drawer shows a
+plain front, and its border is a guess), its free axis ends degrees off, while the object's own directions are known to
+half a degree."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.directions import axis_of, directions_of, turned_onto
+from p2gs.motion.refine_motions import Judge
+from p2gs.parts.settle import relabelled
+
+WITHIN = 15.0  # degrees about a direction in which an axis is tried on it: as where parts are fitted (``snapped``)
+KNOWN = 0.5  # degrees to which directions are known; an axis that is nearer keeps what photographs say
+
+
+def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMotions, list[dict]]:
+    """Each joint's axis that is askew to the directions of the object on the nearest of them, the rest refined, where
+    the energy rises by at most ``price``; with labels chosen anew where the judge has discovery's surfaces.
+
+    Returns the motions and what was tried: part, type, degrees off, energy before and after.
+    """
+    log: list[dict] = []
+    directions = directions_of(judge.states, motions.labels) if len(motions) else torch.zeros(0, 3)
+    held = torch.full((len(motions), 3), math.nan, dtype=torch.float64)
+    for k, kind in enumerate(motions.types):
+        lowest = judge(motions)[0]
+        axis = axis_of(kind, motions.transforms[k])
+        near = sorted((math.degrees(math.acos(min(1.0, abs(float(axis @ d))))), i) for i, d in enumerate(directions))
+        if not near or not KNOWN < near[0][0] <= WITHIN:
+            continue
+        axes = held.clone()
+        axes[k] = directions[near[0][1]]
+        value, laid = _best_laid(judge, motions, k, axes)
+        log.append({"part": k, "type": kind, "degrees": near[0][0], "before": lowest, "after": value})
+        if value <= lowest + price:
+            motions, held = laid, axes
+    return motions, log
+
+
+def _best_laid(judge: Judge, motions: PartMotions, k: int, axes: Tensor) -> tuple[float, PartMotions]:
+    """Energy and motions with part k's axis along ``axes[k]``: as it is turned onto it, refined, or refined with labels
+    chosen anew, whichever has the lowest energy. axes [K, 3]: directions that joints keep (NaN: free)."""
+    points = judge.states[0].gaussians.means[motions.labels[0] == k + 1].double().cpu()
+    middle = points.mean(0) if len(points) else torch.zeros(3, dtype=torch.float64)
+    T = turned_onto(motions.types[k], motions.transforms[k], axes[k], middle)
+    laid = motions.with_motion(k, motions.types[k], T)
+    tried = [laid, judge.refine(laid, axes)]
+    if judge.found is not None:
+        tried.append(judge.refine(relabelled(judge.found, judge.states, tried[1]), axes))
+    return min(((judge(m)[0], m) for m in tried), key=lambda t: t[0])

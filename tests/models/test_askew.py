@@ -1,0 +1,147 @@
+"""A joint that is askew to the object is laid along one of the object's directions where photographs hardly tell."""
+
+import math
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from p2gs.gaussians.handover import PartMotions, StateGaussians
+from p2gs.motion.directions import axis_of, common_normal, directions_of, turned_onto
+from p2gs.motion.screw_polish import allowed_step, along_axes, apply_step
+from p2gs.ops import se3
+from p2gs.parts.askew import lay_axes
+from p2gs.types import GaussianTensors
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def degrees_between(a, b) -> float:
+    return math.degrees(math.acos(min(1.0, abs(float(a @ b)))))
+
+
+def plate(normal: int, offset: float, n: int = 20) -> torch.Tensor:
+    side = torch.linspace(-0.5, 0.5, n)
+    return torch.cat([torch.full((n * n, 1), offset), torch.cartesian_prod(side, side)], 1).roll(normal, 1)
+
+
+def cube(state: int) -> StateGaussians:
+    """The six faces of a cube: flat Gaussians off their plane by thousandths, whose facing is off by degrees."""
+    g = torch.Generator().manual_seed(state)
+    points, quats = [], []
+    for normal in range(3):
+        turn = torch.zeros(400, 4)
+        turn[:, 0] = 1
+        if normal:  # the shortest axis, x, onto y or z
+            turn[:, 0], turn[:, 4 - normal] = math.sqrt(0.5), math.sqrt(0.5)
+        for offset in (-0.5, 0.5):
+            points.append(plate(normal, offset))
+            quats.append(turn + 0.03 * torch.randn(400, 4, generator=g))
+    means = torch.cat(points) + 0.002 * torch.randn(2400, 3, generator=g)
+    scales = torch.tensor([0.001, 0.02, 0.02]).log().repeat(2400, 1)
+    return StateGaussians(
+        state, GaussianTensors(means, torch.cat(quats), scales, torch.full((2400,), 4.0), torch.zeros(2400, 1, 3))
+    )
+
+
+def test_directions_of_a_cube_are_its_axes_to_a_tenth_of_a_degree():
+    labels = [torch.zeros(2400, dtype=torch.long)] * 2
+    found = directions_of([cube(0), cube(1)], labels)
+    assert len(found) == 3
+    assert {int(d.abs().argmax()) for d in found} == {0, 1, 2}
+    assert max(degrees_between(d, torch.eye(3).double()[int(d.abs().argmax())]) for d in found) < 0.1
+    # what moves has no say
+    assert not len(directions_of([cube(0), cube(1)], [torch.ones_like(x) for x in labels]))
+
+
+def test_common_normal_is_that_of_several_planes_at_once():
+    truth = torch.nn.functional.normalize(torch.tensor([0.03, -0.02, 1.0]).double(), dim=0)
+    g = torch.Generator().manual_seed(1)
+    xy = torch.rand(900, 2, generator=g).double() - 0.5
+    z = torch.tensor([0.0, 0.3, 0.7]).double().repeat(300) - xy @ truth[:2] / truth[2]
+    points = torch.cat([xy, z[:, None] + 0.001 * torch.randn(900, 1, generator=g).double()], 1)
+    points[::50, 2] += 0.02  # some lie off their plane
+    normals = UP.expand(900, 3)
+    assert degrees_between(UP, truth) > 2
+    assert degrees_between(common_normal(points, normals, UP, 0.05), truth) < 0.1
+    assert torch.equal(common_normal(points, normals.roll(1, 1), UP, 0.05), UP)  # no plane faces that way
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_motion_that_is_turned_onto_a_direction_goes_as_far_along_it(kind):
+    tilted = torch.nn.functional.normalize(torch.tensor([0.05, 0.1, -1.0]).double(), dim=0)
+    middle = torch.tensor([0.4, 0.1, 0.3]).double()
+    origin = torch.tensor([0.1, 0.1, 0.3]).double()
+    if kind == "revolute":
+        T = se3.from_screw(tilted, origin, torch.tensor(0.7).double())
+    else:
+        T = torch.eye(4).double()
+        T[:3, 3] = 0.3 * tilted
+    laid = turned_onto(kind, T, UP, middle)
+    assert float(axis_of(kind, laid) @ UP) == pytest.approx(-1)  # the same way round
+    if kind == "revolute":
+        assert float(se3.screw_parameters(laid).angle.abs()) == pytest.approx(0.7)
+        assert float((se3.apply(laid, middle[None]) - se3.apply(T, middle[None])).norm()) < 0.05
+    else:
+        assert float(laid[:3, 3].norm()) == pytest.approx(0.3 * abs(float(tilted @ UP)))
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_steps_along_a_held_axis_leave_it_and_others_are_free(kind):
+    g = torch.Generator().manual_seed(2)
+    T = torch.eye(4).double()[None].repeat(2, 1, 1)
+    if kind == "revolute":
+        T[:] = se3.from_screw(UP, torch.tensor([0.3, 0.2, 0.0]).double(), torch.tensor(0.8).double())
+    else:
+        T[:, :3, 3] = 0.4 * UP
+    axes = torch.stack([UP, torch.full((3,), math.nan).double()])
+    centre, radius = torch.rand(2, 3, generator=g).double(), torch.tensor([0.5, 0.5]).double()
+    for _ in range(5):
+        step = allowed_step([kind] * 2, T, centre, radius, 0.05 * torch.randn(2, 6, generator=g).double())
+        T = apply_step(T, centre, radius[:, None], along_axes([kind] * 2, axes, step))
+    assert degrees_between(axis_of(kind, T[0]), UP) < 1e-4
+    assert degrees_between(axis_of(kind, T[1]), UP) > 0.5
+    if kind == "revolute":
+        assert abs(float(T[0, :3, 3] @ UP)) < 1e-9  # no pitch either
+
+
+@dataclass
+class Told:
+    """A judge whose energy is ``slope`` times the angle (degrees) of the first axis to ``best``; it refines nothing."""
+
+    states: list
+    best: torch.Tensor
+    slope: float
+    found = None
+
+    def __call__(self, motions):
+        return self.slope * degrees_between(axis_of(motions.types[0], motions.transforms[0]), self.best), 1.0
+
+    def refine(self, motions, axes=None):
+        return motions
+
+
+def askew(degrees: float) -> PartMotions:
+    T = torch.eye(4).double()[None].clone()
+    T[0, :3, 3] = 0.3 * torch.tensor([math.sin(math.radians(degrees)), 0.0, math.cos(math.radians(degrees))])
+    labels = torch.zeros(2400, dtype=torch.long)
+    labels[:50] = 1
+    return PartMotions(["prismatic"], T, torch.ones(1), [labels] * 2, [torch.ones(2400)] * 2)
+
+
+@pytest.mark.parametrize(
+    "degrees, slope, laid",
+    [
+        (5.0, 0.001, True),  # photographs hardly tell: half a hundredth is lost
+        (5.0, 0.01, False),  # they do
+        (0.3, 0.001, False),  # directions are not known better than that
+        (25.0, 0.0, False),  # of another direction altogether
+    ],
+)
+def test_an_axis_askew_is_laid_where_that_costs_next_to_nothing(degrees, slope, laid):
+    motions = askew(degrees)
+    judge = Told([cube(0), cube(1)], axis_of("prismatic", motions.transforms[0]), slope)
+    found, log = lay_axes(judge, motions, 0.01)
+    off = degrees_between(axis_of("prismatic", found.transforms[0]), UP)
+    assert off < 0.1 if laid else off == pytest.approx(degrees, abs=1e-4)
+    assert len(log) == (0.5 < degrees < 15)
