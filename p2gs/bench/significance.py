@@ -37,7 +37,9 @@ def published_verdicts(spread: Spread) -> Iterator[tuple[str, str, str, str]]:
                 a, b = (Sample(p.value, max(p.std or 0.0, TINY), 3) for p in (mine, other))
             else:
                 a, b = (printed(p.value, p.std or 0.0, METRICS[metric].digits) for p in (mine, other))
-            yield name, object, metric, welch(a, b).verdict(METRICS[metric].higher_is_better)
+            found = welch(a, b)
+            assert found is not None  # both have a spread
+            yield name, object, metric, found.verdict(METRICS[metric].higher_is_better)
 
 
 def counts(spread: Spread) -> Counter:

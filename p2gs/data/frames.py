@@ -54,8 +54,10 @@ class Frame:
         """[3, 3] float64 for an image file of this size."""
         if self.K is not None:
             return self.K.copy()
-        fx = width / (2 * np.tan(self.fov[0] / 2))
-        fy = fx if self.fov[1] is None else height / (2 * np.tan(self.fov[1] / 2))
+        assert self.fov is not None  # where there is no K
+        x, y = self.fov
+        fx = width / (2 * np.tan(x / 2))
+        fy = fx if y is None else height / (2 * np.tan(y / 2))
         return np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1.0]])
 
     @property

@@ -325,7 +325,7 @@ def polishing(record: FinishRecord, twin: ArticulatedObject, states, unit: float
     return out
 
 
-def plain(value):
+def plain(value: Any) -> Any:
     """Numbers of six digits (so that the last bits of a float do not change the file), None for what is not finite."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}

@@ -74,9 +74,8 @@ def draw(
             g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh, camera.viewmat, camera.K,
             camera.width, camera.height, background=colour, backend=backend, **options,
         )  # fmt: skip
-    return RenderOutput(
-        **{f.name: v.cpu() if isinstance(v := getattr(out, f.name), Tensor) else v for f in fields(out)}
-    )
+    values: dict[str, Any] = {f.name: getattr(out, f.name) for f in fields(out)}
+    return RenderOutput(**{name: v.cpu() if isinstance(v, Tensor) else v for name, v in values.items()})
 
 
 def to_image(colour: Tensor) -> np.ndarray:

@@ -103,7 +103,7 @@ def _touching(area: np.ndarray, seen: np.ndarray) -> float:
     """Share of the rim of an area [a, b] bool at or beside which there is seen surface [a, b] bool."""
     from scipy.ndimage import binary_dilation, binary_erosion
 
-    rim = area & ~binary_erosion(area)
+    rim = area & ~np.asarray(binary_erosion(area), dtype=bool)
     return float(binary_dilation(seen)[rim].mean()) if rim.any() else 0.0
 
 

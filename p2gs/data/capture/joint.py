@@ -157,6 +157,7 @@ def join(
         model = filtered(adjusted(model, folder, False, progress))
         if turn + 1 < ROUNDS:
             T = _relative(model, start.model, end.model)
+    assert model is not None  # there is at least one round
     return filtered(adjusted(model, folder, True, progress))
 
 

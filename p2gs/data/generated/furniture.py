@@ -317,6 +317,7 @@ def nested_drawers(rng: np.random.Generator) -> SyntheticObject:
     boards, (cell,) = carcass(rng, palette, 0.9, rng.uniform(0.8, 1.0), rng.uniform(0.5, 0.65), [1])
     outer = drawer(rng, palette, cell, (0.0, rng.uniform(0.65, 0.85)))
     joint, back = outer.joint, outer.primitives[4]
+    assert joint is not None  # a drawer slides
     x0, y0, z1 = back.corners[:, 0].max(), back.corners[:, 1].min(), back.corners[:, 2].max()
     y1, length = back.corners[:, 1].max(), cell.x - back.corners[:, 0].max()
     lag = rng.uniform(0.0, 0.15) * length  # the tray stays behind, so that far it needs room at the drawer's back
