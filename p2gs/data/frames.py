@@ -74,12 +74,19 @@ def there(path: Path) -> bool:
         return False
 
 
-def read_json(path: Path, report: Report):
-    """The parsed file, or None after an error: missing file, or text that is not JSON."""
+def camera_file(path: Path, report: Report) -> bool:
+    """Whether a file of cameras may be read and is there; an error where it is not there."""
     if not report.may_read(path):
-        return None
+        return False
     if not there(path):
         report.error(f"{path}: camera file is missing")
+        return False
+    return True
+
+
+def read_json(path: Path, report: Report):
+    """The parsed file, or None after an error: missing file, or text that is not JSON."""
+    if not camera_file(path, report):
         return None
     try:
         return json.loads(path.read_text(encoding="utf-8"))

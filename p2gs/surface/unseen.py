@@ -64,8 +64,8 @@ def close_unseen_sides(
     """The mesh with planes on the unseen sides of its box, sewn to its open edges and coloured as the seen surface
     nearest to them.
 
-    mesh, poses: start-state coordinates of the part (its number in ``views``).  voxel: of the mesh.  clearance: as in
-    ``seen_empty``.
+    mesh, poses ([4, 4] each): start-state coordinates of the part (its number in ``views``).  voxel: of the mesh.
+    clearance: as in ``seen_empty``.
     """
     if len(mesh.faces) == 0:
         return mesh

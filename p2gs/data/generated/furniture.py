@@ -247,10 +247,16 @@ def _fill(rng: np.random.Generator, palette: Palette, cell: Cell, drawers: float
 
 
 def _storage(
-    rng: np.random.Generator, name: str, columns: list[int], drawers: float, size, open_cells: int = 0
+    rng: np.random.Generator,
+    name: str,
+    columns: list[int],
+    drawers: float,
+    size: tuple[float, float, float],
+    open_cells: int = 0,
 ) -> SyntheticObject:
     palette = Palette(rng)
-    boards, cells = carcass(rng, palette, *size, columns)
+    depth, width, height = size
+    boards, cells = carcass(rng, palette, depth, width, height, columns)
     left_open = (
         set(rng.choice(len(cells), min(open_cells, len(cells) - 1), replace=False).tolist()) if open_cells else set()
     )

@@ -149,7 +149,7 @@ def _mesh(buffer: Buffer, link: Link) -> dict:
 
 
 def linear_light(srgb: np.ndarray) -> np.ndarray:
-    """Colours in 0..1 as pictures have them, in the linear light that glTF's vertex colours are."""
+    """Colours [..., 3] in 0..1 as pictures have them, in the linear light that glTF's vertex colours are."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
