@@ -53,13 +53,6 @@ class Registry(Generic[T]):
     def items(self):
         return self._items.items()
 
-    def name_of(self, item: T) -> str:
-        """The name an item (a class) was registered under. Raises KeyError."""
-        for name, value in self._items.items():
-            if value is item:
-                return name
-        raise KeyError(item)
-
 
 def suggest(name: str, known) -> str:
     """`` (did you mean 'x'?)`` or the list of known names."""

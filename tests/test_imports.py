@@ -120,6 +120,17 @@ def test_there_are_no_cycles():
     assert not around, around
 
 
+def test_the_docs_draw_these_imports():
+    """Between rooms, by a reader of its own, which finds no circle either."""
+    page = (PACKAGE.parent / "docs" / "house.md").read_text(encoding="utf-8")
+    drawn = subprocess.run(
+        [sys.executable, PACKAGE.parent / "bench" / "draw_imports.py"], capture_output=True, text=True, timeout=60
+    )
+    assert drawn.returncode == 0, drawn.stderr
+    told = "docs/house.md: python bench/draw_imports.py draws it anew"
+    assert page.split("```mermaid\n")[1].split("```")[0] == drawn.stdout, told
+
+
 def names_imported(path: Path):
     """Dotted names a file imports; of ``from a import b`` a.b."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

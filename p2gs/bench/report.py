@@ -144,7 +144,7 @@ def between_settings(table: PaperTable, results: Results) -> Iterator[Test]:
             for metric in table.metrics:
                 a, b = ours(results, setting, column, metric), ours(results, table.reference, column, metric)
                 result = welch(a, b) if a is not None and b is not None else None
-                if result is not None:
+                if a is not None and b is not None and result is not None:
                     yield Test(table.name, column, metric, f"p2gs {setting}", f"p2gs {table.reference}", a, b, result)
 
 

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Iterator, Optional, Sequence
+from typing import Any, Iterator, Optional, Sequence
 
 from p2gs.bench.cell import PROGRAM, Outcome, note, run_cell, status
 from p2gs.bench.executors import executor
@@ -39,13 +39,13 @@ def run_bench(
     known |= {cell.name: "todo" for cell in waiting}
     show = display or Display(bench)
     with interruptible():
-        jobs: dict[str, tuple[Cell, object]] = {}
+        jobs: dict[str, tuple[Cell, Any]] = {}
         place = executor(bench.options, functools.partial(run_cell, program=tuple(program))) if waiting else None
         stop = True
         try:
             with show.on(known, place.slots if place else 1):
                 while waiting or jobs:
-                    while waiting and len(jobs) < place.slots:
+                    while place and waiting and len(jobs) < place.slots:
                         cell = waiting.pop(0)
                         jobs[cell.name] = cell, place.start(cell)
                         known[cell.name] = "running"

@@ -33,11 +33,14 @@ def published_verdicts(spread: Spread) -> Iterator[tuple[str, str, str, str]]:
             other = table.numbers.get((THEIRS, object, metric))
             if row != OURS or other is None or mine.value is None or other.value is None:
                 continue
+            numbers = ((mine.value, mine.std or 0.0), (other.value, other.std or 0.0))
             if spread == "printed":
-                a, b = (Sample(p.value, max(p.std or 0.0, TINY), 3) for p in (mine, other))
+                a, b = (Sample(value, max(std, TINY), 3) for value, std in numbers)
             else:
-                a, b = (printed(p.value, p.std or 0.0, METRICS[metric].digits) for p in (mine, other))
-            yield name, object, metric, welch(a, b).verdict(METRICS[metric].higher_is_better)
+                a, b = (printed(value, std, METRICS[metric].digits) for value, std in numbers)
+            found = welch(a, b)
+            assert found is not None  # both have a spread
+            yield name, object, metric, found.verdict(METRICS[metric].higher_is_better)
 
 
 def counts(spread: Spread) -> Counter:

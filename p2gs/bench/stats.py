@@ -63,7 +63,7 @@ def welch(a: Sample, b: Sample, floor: float = TINY) -> Optional[Comparison]:
         return None
     from scipy.stats import t as student
 
-    va, vb = (max(s.std, floor) ** 2 / s.n for s in (a, b))
+    va, vb = max(a.std, floor) ** 2 / a.n, max(b.std, floor) ** 2 / b.n
     t = (a.mean - b.mean) / math.sqrt(va + vb)
     degrees = (va + vb) ** 2 / (va**2 / (a.n - 1) + vb**2 / (b.n - 1))
     return Comparison(t, float(2 * student.sf(abs(t), degrees)), degrees)

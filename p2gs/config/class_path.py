@@ -98,10 +98,8 @@ def plain_sections(tree: Plain, where: str) -> Plain:
     return out
 
 
-def with_class_paths(sections: Optional[Plain], registry: Registry) -> Optional[Plain]:
+def with_class_paths(sections: Plain, registry: Registry) -> Plain:
     """What ``plain_sections`` took apart, put together again for a file that is read back."""
-    if sections is None:
-        return None
     named = {n: v for n, v in sections.items() if n in registry.paths and v is not None}
     return sections | {n: {"class_path": registry.paths[n], "init_args": v} for n, v in named.items()}
 

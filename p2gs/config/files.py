@@ -15,11 +15,15 @@ from p2gs.config.schema import Plain, merge, nested
 from p2gs.registry import suggest
 from p2gs.types import UserError, short
 
+MAX_DEPTH = 20  # of a config; the deepest key of ours has 6 levels
+MAX_VALUES = 10_000  # of a config, aliases counted as often as they stand for something; ours have some 400
+# beside its own errors the loader lets those of a date, a number or a tag through that are none
+UNREADABLE = (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError, OverflowError, OSError)
+
 
 @dataclass
 class Layer:
-    """One config file or the command line. where: what an error message starts with (``configs/x.yaml: `` or
-    nothing)."""
+    """One config file or the command line. where: what an error message starts with (``configs/x.yaml: ``)."""
 
     tree: Plain
     where: str = ""
@@ -29,17 +33,12 @@ class _StrictLoader(yaml.SafeLoader):
     """YAML where a key given twice is an error: the first one would be dropped without a word."""
 
     def construct_mapping(self, node, deep=False):
-        if not isinstance(node, yaml.MappingNode):
-            raise yaml.constructor.ConstructorError(None, None, f"expected a mapping, got {node.id}", node.start_mark)
         seen = set()
-        for key_node, _ in node.value:
+        for key_node, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str) and not isinstance(key, (int, float)):
-                raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is no text", key_node.start_mark)
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key '{key}' is given twice", key_node.start_mark
-                )
+            wrong = "is no text" if not isinstance(key, (str, int, float)) else "is given twice" if key in seen else ""
+            if wrong:
+                raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' {wrong}", key_node.start_mark)
             seen.add(key)
         return super().construct_mapping(node, deep)
 
@@ -54,22 +53,17 @@ def find_config(name: str, beside: Optional[Path] = None) -> Path:
     """The config file of that name: as given (relative to ``beside``), else among p2gs's own; ``.yaml`` may be left
     out."""
     given = Path(name)
-    tries = [(beside / given) if beside else given]
-    inner = Path(*given.parts[1:]) if given.parts and given.parts[0] == "configs" and len(given.parts) > 1 else given
-    tries += [folder / inner for folder in config_folders() if not given.is_absolute()]
-    for path in tries:
+    inner = Path(*given.parts[1:]) if given.parts[:1] == ("configs",) else given
+    own = [] if given.is_absolute() else [folder / inner for folder in config_folders()]
+    for path in (beside / given if beside else given, *own):
         for candidate in (path, path.with_name(path.name + ".yaml")) if path.name else ():
-            if _is_file(candidate):
-                return candidate
+            try:
+                if candidate.is_file():
+                    return candidate
+            except (OSError, ValueError):  # a name that no file can have
+                continue
     known = sorted({str(p.relative_to(f).as_posix()) for f in config_folders() for p in f.rglob("*.yaml")})
     raise UserError(f"config file {short(name)} is not there{suggest(name[:200], known)}")
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # a name that no file can have
-        return False
 
 
 def read_config(
@@ -85,9 +79,20 @@ def read_config(
         _stay_inside(path, parents, strict)
     if path.resolve() in parents:
         raise UserError(f"{path}: includes itself")
+    tree = read_yaml(path)
+    includes = tree.pop("include", None) or []
+    includes = [includes] if isinstance(includes, str) else includes
+    if not isinstance(includes, list) or not all(isinstance(include, str) for include in includes):
+        raise UserError(f"{path}: include: expected a file or a list of files, got {short(includes)}")
+    inside = (path.parent, (*parents, path.resolve()), strict or tree.get("strict_paths") is True)
+    return [*(layer for include in includes for layer in read_config(include, *inside)), Layer(tree, f"{path}: ")]
+
+
+def read_yaml(path: Path) -> Plain:
+    """A file's mapping. Raises UserError where it cannot be read, holds no mapping, or one that no config can be."""
     try:
         tree = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)
-    except _UNREADABLE as err:
+    except UNREADABLE as err:
         mark = getattr(err, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
         raise UserError(f"{path}{line}: {getattr(err, 'problem', None) or str(err) or type(err).__name__}") from err
@@ -95,28 +100,13 @@ def read_config(
     if not isinstance(tree, dict):
         raise UserError(f"{path}: expected a mapping (key: value), got {type(tree).__name__}")
     _check_tree(tree, f"{path}")
-    includes = tree.pop("include", None) or []
-    includes = [includes] if isinstance(includes, str) else includes
-    if not isinstance(includes, list) or not all(isinstance(include, str) for include in includes):
-        raise UserError(f"{path}: include: expected a file or a list of files, got {short(includes)}")
-    layers: list[Layer] = []
-    for include in includes:
-        layers += read_config(
-            include, path.parent, (*parents, path.resolve()), strict or tree.get("strict_paths") is True
-        )
-    return [*layers, Layer(tree, f"{path}: ")]
+    return tree
 
 
 def run_values(run_dir: Path | str) -> Plain:
-    """RUN/config.yaml as plain values, {} where there is none. Raises UserError where that file is no readable YAML."""
+    """RUN/config.yaml as plain values, {} where there is none. Raises UserError where that file is no config."""
     path = Path(run_dir) / "config.yaml"
-    if not path.is_file():
-        return {}
-    try:
-        values = yaml.safe_load(path.read_text())
-    except _UNREADABLE as err:
-        raise UserError(f"{path} is not readable YAML: {err}") from err
-    return values if isinstance(values, dict) else {}
+    return read_yaml(path) if path.is_file() else {}
 
 
 def _stay_inside(path: Path, parents: tuple[Path, ...], strict: bool) -> None:
@@ -127,12 +117,6 @@ def _stay_inside(path: Path, parents: tuple[Path, ...], strict: bool) -> None:
     if strict:
         raise UserError(f"{sentence}; refused, as strict_paths asks")
     print(f"note: {sentence}", file=sys.stderr, flush=True)
-
-
-# beside its own errors the loader lets those of a date, a number or a tag through that are none
-_UNREADABLE = (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError, OverflowError, OSError)
-MAX_DEPTH = 20  # of a config; the deepest key of ours has 6 levels
-MAX_VALUES = 10_000  # of a config, aliases counted as often as they stand for something; ours have some 400
 
 
 def _check_tree(tree: Plain, where: str) -> None:
@@ -161,10 +145,9 @@ def parse_overrides(words: list[str]) -> list[tuple[str, Any]]:
                 f"'{word}' belongs to no option (single values are given as --key value, config files as -c FILE)"
             )
         key, equals, value = word[2:].partition("=")
-        if not equals:
-            value = next(rest, "--none")
-            if value.startswith("--") and len(value) > 2:
-                raise UserError(f"--{key} needs a value")
+        value = value if equals else next(rest, "--none")
+        if not equals and value.startswith("--") and len(value) > 2:
+            raise UserError(f"--{key} needs a value")
         out.append((key, _read_value(key, value)))
     return out
 
@@ -174,7 +157,7 @@ def _read_value(key: str, text: str) -> Any:
         return text
     try:
         value = yaml.load(text, Loader=_StrictLoader)
-    except _UNREADABLE as err:
+    except UNREADABLE as err:
         raise UserError(f"--{key}: {short(text)} cannot be read ({getattr(err, 'problem', err)})") from err
     _check_tree({key: value}, f"--{key}")
     return value
@@ -192,9 +175,7 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-_Dumper.add_representer(
-    list, lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
-)
+_Dumper.add_representer(list, lambda d, data: d.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True))
 
 
 def to_yaml(tree: Plain) -> str:

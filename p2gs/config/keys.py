@@ -17,7 +17,7 @@ from p2gs.types import UserError, short
 STAGES = ("single_state", "registration", "discovery", "sharpen", "canonical_fusion", "articulation", "finish")
 
 
-@dataclass
+@dataclass(eq=False)
 class Options:
     """Top-level options of a run.
 
@@ -44,6 +44,7 @@ class Options:
     trainer: Optional[dict] = field(default_factory=dict)
 
     def __post_init__(self):
+        self.trainer = self.trainer or {}
         if self.run is not None and "\0" in self.run:
             raise UserError(f"run: expected a folder, got {short(self.run)}")
         if not 0 <= self.seed < 2**32:

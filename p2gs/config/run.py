@@ -8,6 +8,7 @@ earlier ones field by field. ``callbacks`` at the top is for all phases; a phase
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import pkgutil
@@ -21,6 +22,7 @@ from p2gs.config.keys import Options, data_class, run_keys
 from p2gs.config.schema import Given, Plain, check_keys, merge
 from p2gs.config.trainer import check_trainer_options
 from p2gs.data.base import DATASETS, TwoStateData
+from p2gs.data.layouts import format_of
 from p2gs.losses.base import LOSSES, Loss
 from p2gs.models.phase import PHASES
 from p2gs.provenance import provenance
@@ -37,84 +39,74 @@ class PhaseSection:
 
     def __init__(self, name: str, tree: Plain, shared: Plain):
         phase, path = PHASES[name], f"phases.{name}."
-        trained = getattr(phase, "trained", True)
         self._own: Plain = tree.get("callbacks") or {}
         self._config = Given(phase.Config, {k: v for k, v in tree.items() if k not in ("losses", "callbacks")}, path)
-        self._losses = switched_on(LOSSES, tree.get("losses") or {}, f"{path}losses.") if trained else None
-        self._callbacks = switched_on(CALLBACKS, merge(shared, self._own), f"{path}callbacks.") if trained else {}
+        self._on: dict[str, dict[str, Given]] = {}
+        if getattr(phase, "trained", True):
+            self._on["losses"] = switched_on(LOSSES, tree.get("losses") or {}, f"{path}losses.")
+            self._on["callbacks"] = switched_on(CALLBACKS, merge(shared, self._own), f"{path}callbacks.")
         self.config: Any = self._config.make()
-        self.losses: dict[str, Loss] = {name: given.make() for name, given in (self._losses or {}).items()}
+        self.losses: dict[str, Loss] = {name: given.make() for name, given in self._on.get("losses", {}).items()}
         self.callbacks = self.new_callbacks()
 
     def new_callbacks(self) -> dict[str, Callback]:
         """Fresh callbacks, for a phase that runs more than once."""
-        return {name: given.make() for name, given in self._callbacks.items()}
+        return {name: given.make() for name, given in self._on.get("callbacks", {}).items()}
 
     def decisive(self) -> Plain:
         """What decides the phase's result: its options, losses, and callbacks that change it."""
-        if self._losses is None:
-            return self._config.values
-        callbacks = {
-            name: given.values for name, given in self._callbacks.items() if self.callbacks[name].changes_result
-        }
-        return {
-            **self._config.values,
-            "losses": {name: given.values for name, given in self._losses.items()},
-            "callbacks": callbacks,
-        }
+        idle = {name for name, callback in self.callbacks.items() if not callback.changes_result}
+        on = {k: {n: g.values for n, g in on.items() if n not in idle or k == "losses"} for k, on in self._on.items()}
+        return {**self._config.values, **on}
 
     def to_dict(self) -> Plain:
         """All of it; of the callbacks what the phase's own section says, so that a later file still reaches the
         others."""
-        if self._losses is None:
+        if not self._on:
             return self._config.values
-        full = {name: given.values for name, given in self._callbacks.items()}
+        full = {name: given.values for name, given in self._on["callbacks"].items()}
         own = {name: None if given is None else {k: full[name][k] for k in given} for name, given in self._own.items()}
-        losses = written(LOSSES, self._losses)
+        losses = written(LOSSES, self._on["losses"])
         return {**self._config.values, "losses": losses, "callbacks": with_class_paths(own, CALLBACKS)}
 
 
 def switched_on(registry: Registry, tree: Plain, path: str) -> dict[str, Given]:
     """The registered classes that the tree mentions, but those it says null of."""
-    return {
-        name: Given(cls, tree[name], f"{path}{name}.") for name, cls in registry.items() if tree.get(name) is not None
-    }
+    on = {name: cls for name, cls in registry.items() if tree.get(name) is not None}
+    return {name: Given(cls, tree[name], f"{path}{name}.") for name, cls in on.items()}
 
 
-def written(registry: Registry, on: dict[str, Given]) -> Optional[Plain]:
+def written(registry: Registry, on: dict[str, Given]) -> Plain:
     """Every registered name with its options, null where it is off."""
     return with_class_paths({name: on[name].values if name in on else None for name in registry}, registry)
 
 
-class RunConfig:
+class RunConfig(Options):
     """The merged config. Attributes: those of ``Options``, ``phases`` (name -> PhaseSection), ``data`` (built when
     first asked for)."""
+
+    trainer: Plain
 
     def __init__(self, tree: Plain, data_format: Optional[str]):
         """tree: merged, its keys checked."""
         self._options = Given(Options, {k: v for k, v in tree.items() if k not in ("data", "phases", "callbacks")})
-        options: Options = self._options.make()
-        self.seed, self.run, self.device, self.threads = options.seed, options.run, options.device, options.threads
-        self.rasterizer, self.num_parts, self.plugins = options.rasterizer, options.num_parts, options.plugins
-        self.exact_parts, self.strict_paths, self.stages = options.exact_parts, options.strict_paths, options.stages
-        self.trainer: Plain = options.trainer or {}
+        vars(self).update(vars(self._options.make()))
         check_trainer_options(self.trainer)
         given = {k: v for k, v in (tree.get("data") or {}).items() if k != "format"}
-        self._given_data, self._data = Given(data_class(data_format), given, "data."), None
+        self._given_data = Given(data_class(data_format), given, "data.")
         self.data_options: Plain = {"format": data_format, **self._given_data.values}
         shared, phases = tree.get("callbacks") or {}, tree.get("phases") or {}
         self._callbacks = switched_on(CALLBACKS, shared, "callbacks.")
         self.phases = {name: PhaseSection(name, phase, shared) for name, phase in phases.items() if phase is not None}
 
-    @property
+    @functools.cached_property
     def data(self) -> TwoStateData:
         """The data module. Raises UserError when no format or no required option (root) is given."""
-        if self._data is None:
-            if self.data_options["format"] is None:
-                raise UserError(f"data.format is not given (--data.format NAME); known: {', '.join(sorted(DATASETS))}")
-            self._data = self._given_data.make()
-            self._data.strict_paths = self.strict_paths
-        return self._data
+        if self.data_options["format"] is None:
+            raise UserError(f"data.format is not given (--data.format NAME); known: {', '.join(sorted(DATASETS))}")
+        made = self._given_data.make()
+        made.strict_paths = self.strict_paths
+        return made
 
     @property
     def scene_name(self) -> str:
@@ -170,53 +162,29 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
     for layer in layers:
         given = layer.tree.get("plugins") or []
         given = [given] if isinstance(given, str) else given
-        if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
-            raise UserError(f"{layer.where}plugins: expected a list of modules, got {short(given)}")
-        names += given
-    names = list(dict.fromkeys(map(str, names)))
-    load_plugins(tuple(names))
+        names += Given(Options, {"plugins": given}, layer.where).values["plugins"]
+    load_plugins(tuple(dict.fromkeys(names)))
     import_builtins()
     layers = [Layer(plain_sections(layer.tree, layer.where), layer.where) for layer in layers]
 
-    formats, current, root = [], None, None
+    formats, root = [None], None  # of each layer: its own format or the last one before it
     for layer in layers:
         data = layer.tree.get("data")
-        if isinstance(data, dict):
-            current, root = data.get("format") or current, data.get("root") or root
-            if current is not None and not isinstance(current, str):
-                raise UserError(f"{layer.where}data.format: expected text, got {short(current)}")
-        formats.append(current)
-    if current is None and isinstance(root, str):
-        current = _format_found(Path(root))
-    keys, merged = run_keys(current), {}
-    for layer, name in zip(layers, formats, strict=True):
-        check_keys(layer.tree, keys if name in (None, current) else run_keys(name), layer.where)
+        data = data if isinstance(data, dict) else {}
+        formats.append(data.get("format") or formats[-1])
+        if not isinstance(formats[-1], (str, type(None))):
+            raise UserError(f"{layer.where}data.format: expected text, got {short(formats[-1])}")
+        root = data.get("root") or root
+    last = format_of(Path(root)) if formats[-1] is None and isinstance(root, str) else formats[-1]
+    keys, merged = run_keys(last), {}
+    for layer, name in zip(layers, formats[1:], strict=True):
+        check_keys(layer.tree, keys if name in (None, last) else run_keys(name), layer.where)
         merged = merge(merged, layer.tree)
     merged.pop("p2gs", None)
-    merged["plugins"] = names
+    merged["plugins"] = list(dict.fromkeys(names))
     if merged.get("data"):  # another format came later: keep what it knows too
         merged["data"] = {k: v for k, v in merged["data"].items() if k in keys["data"]}
-    return RunConfig(merged, current)
-
-
-def _format_found(root: Path) -> str:
-    """The data format that the folder given as data.root looks like. Raises UserError where it is none, or there is no
-    such folder."""
-    from p2gs.data.layouts import LAYOUTS, detect_format
-
-    try:
-        present = root.is_dir()
-    except (OSError, ValueError):  # a name that no folder can have
-        present = False
-    if not present:
-        raise UserError(f"data.root: the folder {str(root)[:300]} is not there")
-    found = detect_format(root)
-    if found is None:
-        known = ", ".join(LAYOUTS)
-        raise UserError(
-            f"data.format is not given, and {root} looks like none of the layouts {known}; give --data.format NAME"
-        )
-    return found
+    return RunConfig(merged, last)
 
 
 def import_builtins() -> None:

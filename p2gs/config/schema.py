@@ -14,7 +14,7 @@ import re
 import types
 import typing
 from pathlib import Path
-from typing import Any, Iterator, Union
+from typing import Any, Iterator
 
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 
@@ -23,13 +23,13 @@ from p2gs.types import UserError, short
 Plain = dict[str, Any]
 Keys = dict[str, Any]  # option names, nested as they are given; None: a single value
 IT = "it"  # where jsonargparse keeps a class's options
+WORDS = {int: "a whole number", float: "a number", str: "text", bool: "true or false", Path: "a path"}
 # a config makes no object of a class that nothing asked for
 set_parsing_settings(instantiate_subclass_spec_in_any=False)
 
 
 def merge(base: Plain, over: Plain) -> Plain:
-    """``over`` laid on ``base``: dicts merge key by key, anything else (null too) replaces. Neither argument is
-    changed."""
+    """``over`` laid on ``base``: dicts merge key by key, anything else (null too) replaces. Neither is changed."""
     out = dict(base)
     for key, value in over.items():
         out[key] = merge(out[key], value) if isinstance(value, dict) and isinstance(out.get(key), dict) else value
@@ -38,9 +38,7 @@ def merge(base: Plain, over: Plain) -> Plain:
 
 def nested(path: str, value: Any) -> Plain:
     """``nested("a.b", 1) == {"a": {"b": 1}}``."""
-    for part in reversed(path.split(".")):
-        value = {part: value}
-    return value
+    return functools.reduce(lambda inner, part: {part: inner}, reversed(path.split(".")), value)
 
 
 @functools.cache
@@ -57,10 +55,8 @@ def _parser(cls: type) -> tuple[ArgumentParser, list[str], Namespace]:
 @functools.cache
 def keys_of(cls: type) -> Keys:
     """The options of a dataclass, or the arguments of any other class's ``__init__``."""
-    tree: Keys = {}
-    for action in _parser(cls)[0]._actions:
-        tree = merge(tree, nested(action.dest, None))
-    return tree.get(IT) or {}
+    actions = _parser(cls)[0]._actions
+    return functools.reduce(merge, (nested(action.dest, None) for action in actions), {}).get(IT) or {}
 
 
 class Given:
@@ -73,19 +69,15 @@ class Given:
     def __init__(self, cls: type, tree: Plain, path: str = ""):
         self.cls, self.path = cls, path
         parser, _, defaults = _parser(cls)
-        self._made = self._read(parser, _without_null(tree, keys_of(cls))) if tree else defaults.clone()
-        self.values: Plain = plain(self._made.as_dict().get(IT) or {})
-
-    def _read(self, parser: ArgumentParser, tree: Plain) -> Namespace:
         try:
-            made = parser.parse_object({IT: tree})
+            self._made = parser.parse_object({IT: _without_null(tree, keys_of(cls))}) if tree else defaults.clone()
         except Exception as err:  # told in several lines; the user gets one
             found = re.search(rf'"{IT}\.([\w.]+)"', str(err))
             raise self._wrong(found[1] if found else "", tree) from err
-        for key, value in made.items():
+        self.values: Plain = plain(self._made.as_dict().get(IT) or {})
+        for key, value in self._made.items():
             if any(isinstance(x, float) and math.isnan(x) for x in (value if isinstance(value, list) else [value])):
                 raise self._wrong(key.partition(".")[2], tree)
-        return made
 
     def _wrong(self, key: str, tree: Plain) -> UserError:
         value = functools.reduce(lambda at, name: at.get(name) if isinstance(at, dict) else at, key.split("."), tree)
@@ -101,14 +93,10 @@ class Given:
         return parser.instantiate(self._made.clone())[IT] if IT in self._made else self.cls()
 
 
-def _without_null(tree: Plain, keys: Keys) -> Plain:
+def _without_null(tree: Any, keys: Keys) -> Plain:
     """The tree without groups of options that are null: these stay at their defaults."""
-    groups = {name: inner for name, inner in keys.items() if inner is not None}
-    return {
-        k: _without_null(v, groups[k]) if k in groups else v
-        for k, v in tree.items()
-        if k not in groups or v is not None
-    }
+    kept = {name: value for name, value in tree.items() if value is not None or keys.get(name) is None}
+    return {name: _without_null(value, keys[name] or {}) if keys.get(name) else value for name, value in kept.items()}
 
 
 def plain(value: Any) -> Any:
@@ -148,43 +136,29 @@ def walk(keys: Keys, prefix: str = "") -> Iterator[str]:
 
 
 def nearest(path: str, known: list[str]) -> str:
-    """`` (did you mean 'x'?)``: the key that ends so, a sibling like it, its name elsewhere, a name like it elsewhere;
-    or the siblings."""
+    """`` (did you mean 'x'?)``: of the keys whose last name is like this one's, the one that is likest as a whole; or
+    the siblings."""
     parent, _, last = path.rpartition(".")
-    siblings = {k.rpartition(".")[2]: k for k in known if k.rpartition(".")[0] == parent}
-    names = {k.rpartition(".")[2] for k in known}
+    names = difflib.get_close_matches(last, {k.rpartition(".")[2] for k in known}, n=9)
+    alike = [k for k in known if k.rpartition(".")[2] in names]
+    if alike:
+        likeness = {k: sum(_ratio(*two) for two in ((last, k.rpartition(".")[2]), (path, k))) for k in alike}
+        return f" (did you mean '{max(alike, key=likeness.__getitem__)}'?)"
+    siblings = sorted(k.rpartition(".")[2] for k in known if k.rpartition(".")[0] == parent)
+    return f"; known here: {', '.join(siblings)}" if siblings else ""
 
-    def alike(candidates, cutoff: float) -> list[str]:
-        return difflib.get_close_matches(last, candidates, n=1, cutoff=cutoff)
 
-    options = (
-        [k for k in known if k.endswith("." + path)]
-        or [siblings[n] for n in alike(siblings, 0.6)]
-        or [k for k in known if k.rpartition(".")[2] == last]
-        or [k for n in alike(names, 0.75) for k in known if k.rpartition(".")[2] == n]
-    )
-    if options:
-        best = max(options, key=lambda k: difflib.SequenceMatcher(None, path, k).ratio())
-        return f" (did you mean '{best}'?)"
-    return f"; known here: {', '.join(sorted(siblings))}" if siblings else ""
+def _ratio(a: str, b: str) -> float:
+    return difflib.SequenceMatcher(None, a, b).ratio()
 
 
 def describe(hint: Any) -> str:
     """A type in words a user reads: ``a number``, ``one of a, b``, ``a whole number or null``."""
-    words: dict[Any, str] = {
-        int: "a whole number",
-        float: "a number",
-        str: "text",
-        bool: "true or false",
-        Path: "a path",
-    }
-    if hint in words:
-        return words[hint]
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
-        return f"one of {', '.join(map(str, args))}" if len(args) > 1 else "".join(f"'{a}'" for a in args)
-    if origin in (Union, types.UnionType):
+        return f"one of {', '.join(map(str, args))}" if args[1:] else "".join(f"'{a}'" for a in args)
+    if origin in (typing.Union, types.UnionType):
         return " or ".join("null" if a is type(None) else describe(a) for a in args)
     if origin in (list, tuple):
-        return f"a list like [{', '.join(describe(a) if a is not Ellipsis else '...' for a in args)}]"
-    return getattr(hint, "__name__", str(hint))
+        return f"a list like [{', '.join('...' if a is Ellipsis else describe(a) for a in args)}]"
+    return WORDS.get(hint) or getattr(hint, "__name__", str(hint))

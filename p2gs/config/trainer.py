@@ -8,12 +8,12 @@ trainer:
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from pathlib import Path
 from typing import Any
 
 from p2gs.config.class_path import instance
+from p2gs.registry import suggest
 from p2gs.types import UserError, short
 
 STEPS = "a phase's steps are phases.NAME.steps"
@@ -45,9 +45,8 @@ def check_trainer_options(options: dict[str, Any]) -> None:
         if name in REFUSED:
             raise UserError(f"trainer.{name}: cannot be set: {REFUSED[name]}")
         if name not in known:
-            close = difflib.get_close_matches(str(name), [n for n in known if n not in REFUSED], n=1)
-            hint = f" (did you mean '{close[0]}'?)" if close else ""
-            raise UserError(f"trainer: Lightning's Trainer has no '{name}'{hint}")
+            near = suggest(str(name), [n for n in known if n not in REFUSED])
+            raise UserError(f"trainer: Lightning's Trainer has no '{name}'{near}")
         if name == "precision" and value not in FULL_PRECISION:
             only = "Gaussians are trained in float32, which is all that the kernels know"
             raise UserError(f"trainer.precision: {only}, got {short(value)}")

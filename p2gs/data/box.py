@@ -34,7 +34,8 @@ def farthest_cameras(positions: np.ndarray, count: int, start: int = 0) -> list[
 
 
 def mask_bounds(alpha: Tensor) -> tuple[int, int, int, int]:
-    """(x0, y0, x1, y1), exclusive at the upper end, of the pixels with alpha > 0; (0, 0, W, H) where there are none."""
+    """(x0, y0, x1, y1), exclusive at the upper end, of the pixels with alpha [H, W] > 0; (0, 0, W, H) where there are
+    none."""
     inside = alpha.numpy() > 0
     rows = np.flatnonzero(inside.any(axis=1))
     if rows.size == 0:

@@ -12,7 +12,7 @@ from typing import Optional
 
 import numpy as np
 
-from p2gs.data.frames import Frame, check_frames, check_K, opengl_pose, there
+from p2gs.data.frames import Frame, camera_file, check_frames, check_K, opengl_pose, there
 from p2gs.data.report import Report
 from p2gs.types import short
 
@@ -26,10 +26,7 @@ def ground_truth_folder(root: Path) -> Optional[Path]:
 
 
 def _read_K(path: Path, report: Report) -> Optional[np.ndarray]:
-    if not report.may_read(path):
-        return None
-    if not there(path):
-        report.error(f"{path}: camera file is missing")
+    if not camera_file(path, report):
         return None
     try:
         values = np.array(path.read_text(encoding="utf-8").replace(",", " ").split(), dtype=np.float64)
@@ -44,10 +41,7 @@ def _read_K(path: Path, report: Report) -> Optional[np.ndarray]:
 def _read_keyframes(path: Path, report: Report) -> Optional[dict]:
     import yaml
 
-    if not report.may_read(path):
-        return None
-    if not there(path):
-        report.error(f"{path}: camera file is missing")
+    if not camera_file(path, report):
         return None
     try:
         keyframes = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))

@@ -9,12 +9,12 @@ from torch import Tensor
 
 
 def linear(srgb: np.ndarray) -> np.ndarray:
-    """sRGB 0..1 to linear light."""
+    """sRGB 0..1 to linear light, an array of any shape."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def encoded(light: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB 0..1."""
+    """Linear light to sRGB 0..1, an array of any shape."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
 
 

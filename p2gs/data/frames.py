@@ -54,8 +54,10 @@ class Frame:
         """[3, 3] float64 for an image file of this size."""
         if self.K is not None:
             return self.K.copy()
-        fx = width / (2 * np.tan(self.fov[0] / 2))
-        fy = fx if self.fov[1] is None else height / (2 * np.tan(self.fov[1] / 2))
+        assert self.fov is not None  # where there is no K
+        x, y = self.fov
+        fx = width / (2 * np.tan(x / 2))
+        fy = fx if y is None else height / (2 * np.tan(y / 2))
         return np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1.0]])
 
     @property
@@ -72,12 +74,19 @@ def there(path: Path) -> bool:
         return False
 
 
-def read_json(path: Path, report: Report):
-    """The parsed file, or None after an error: missing file, or text that is not JSON."""
+def camera_file(path: Path, report: Report) -> bool:
+    """Whether a file of cameras may be read and is there; an error where it is not there."""
     if not report.may_read(path):
-        return None
+        return False
     if not there(path):
         report.error(f"{path}: camera file is missing")
+        return False
+    return True
+
+
+def read_json(path: Path, report: Report):
+    """The parsed file, or None after an error: missing file, or text that is not JSON."""
+    if not camera_file(path, report):
         return None
     try:
         return json.loads(path.read_text(encoding="utf-8"))

@@ -38,7 +38,8 @@ def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def resize_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The source pixel under each new pixel's centre (cv2's INTER_NEAREST takes the corner's, half a pixel off)."""
+    """[height, width, ...]: the pixel of image [H, W, ...] under each new pixel's centre (cv2's INTER_NEAREST takes the
+    corner's, half a pixel off)."""
     rows = ((np.arange(height) + 0.5) * image.shape[0] / height).astype(np.int64)
     cols = ((np.arange(width) + 0.5) * image.shape[1] / width).astype(np.int64)
     return image[rows[:, None], cols[None]]
@@ -54,6 +55,7 @@ def premultiply(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def to_uint8(x: np.ndarray) -> np.ndarray:
+    """Numbers 0..255 rounded, an array of any shape."""
     return np.clip(np.rint(x), 0, 255).astype(np.uint8)
 
 
@@ -66,8 +68,8 @@ def downscale_rgba(image: np.ndarray, alpha: np.ndarray, width: int, height: int
 
 
 def coverage(mask: np.ndarray) -> np.ndarray:
-    """Alpha of a mask file, uint8: any number above 0 is the object, as in DTA, unless most of the object is 255 and
-    its rim lies between.
+    """Alpha [H, W] of a mask file, uint8: any number above 0 is the object, as in DTA, unless most of the object is 255
+    and its rim lies between.
 
     Such a mask was drawn with soft edges. Read as "above 0" it grows the object by half a pixel on all sides.
     """

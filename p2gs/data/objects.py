@@ -108,6 +108,7 @@ def find_objects(root: Path | str, objects: Iterable[BenchmarkObject]) -> dict[s
     places: list[tuple[str, Location]] = []
     for folder in scene_folders(Path(root)):
         format = detect_format(folder)
+        assert format is not None  # it is a scene's folder
         if format == "paris" and (folder / "load").is_dir():
             places += [(source, Location(folder, format, source)) for source in sources(folder) if source]
             if "" not in sources(folder):

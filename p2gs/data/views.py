@@ -116,11 +116,11 @@ class TrainingViews:
             bounds = mask_bounds(torch.from_numpy(pixels[..., 3] >= 0.5))
             x, y, w, h = crop_window(bounds, width, height, max(2, round(margin * max(width, height))), align)
         window = (slice(y, y + h), slice(x, x + w))
-        pixels = torch.from_numpy(to_uint8(pixels[window]))
+        shown = torch.from_numpy(to_uint8(pixels[window]))
         return _Stored(
             camera.cropped(x, y, w, h),
-            pixels[..., :3].contiguous(),
-            pixels[..., 3].contiguous(),
+            shown[..., :3].contiguous(),
+            shown[..., 3].contiguous(),
             None if depth is None else torch.from_numpy(np.ascontiguousarray(depth[window])),
             (view.state, view.split, view.name, width, height, x, y, w, h),
         )

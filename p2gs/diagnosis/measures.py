@@ -180,8 +180,8 @@ def motion_evidence(motions: PartMotions, states: list[StateGaussians]) -> dict:
 
 
 def evidence_points(motions: PartMotions, state: StateGaussians) -> tuple[Tensor, Optional[Tensor]]:
-    """Indices of the Gaussians discovery looked at and what it saw of each: 1 moved, 0 static, -1 unknown (None: not
-    recorded)."""
+    """Indices [M] of the Gaussians discovery looked at and what it saw of each [M]: 1 moved, 0 static, -1 unknown
+    (None: not recorded)."""
     solid = (
         (torch.sigmoid(state.gaussians.opacity_logits) > motions.diagnostics.get("min_opacity", 0.5))
         .nonzero()
@@ -325,7 +325,7 @@ def polishing(record: FinishRecord, twin: ArticulatedObject, states, unit: float
     return out
 
 
-def plain(value):
+def plain(value: Any) -> Any:
     """Numbers of six digits (so that the last bits of a float do not change the file), None for what is not finite."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}

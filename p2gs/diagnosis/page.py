@@ -105,7 +105,7 @@ def page(d: dict, strips: Sequence[tuple[str, str, np.ndarray]], name: str) -> s
 
 
 def png(picture: np.ndarray) -> str:
-    """A picture as a data URI."""
+    """A picture, uint8 [H, W, 3], as a data URI."""
     import cv2
 
     done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))

@@ -115,7 +115,7 @@ def moved_here(state: StateGaussians, record: FinishRecord, s: int, shot: Target
 
 
 def heat(colour: Tensor, shot: TargetImage) -> np.ndarray:
-    """|render - photo| as a picture: dark 0, brightest ``WORST``."""
+    """|render - photo| as a picture, uint8 [H, W, 3]: dark 0, brightest ``WORST``. render: [H, W, 3]."""
     import cv2
 
     error = (colour.clamp(0, 1) - shot.image).abs().mean(-1).div(WORST).clamp(0, 1)
@@ -137,7 +137,7 @@ def marked(
 
 
 def strip(rows: list[list[tuple[str, np.ndarray]]]) -> np.ndarray:
-    """Captioned pictures in rows and columns."""
+    """Captioned pictures, uint8 [h, w, 3] each, in rows and columns: one [H, W, 3]."""
     columns = max(map(len, rows))
     blank = ("", np.full((CELL, CELL, 3), 255, np.uint8))
     lines = [

@@ -146,8 +146,8 @@ def start_box(run_dir: Path | str) -> np.ndarray:
 
 
 def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placement:
-    """Where the object stands in the target: an even permutation of the axes turns z up into ``up``, so nothing is
-    mirrored."""
+    """Where the object of points [N, 3] stands in the target: an even permutation of the axes turns z up into ``up``,
+    so nothing is mirrored."""
     lo, hi = points.min(0), points.max(0)
     where = {
         "keep": np.zeros(3),

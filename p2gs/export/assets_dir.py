@@ -50,8 +50,8 @@ def write_obj(
     colours: Optional[np.ndarray] = None,
     texture: Optional[Texture] = None,
 ) -> None:
-    """Wavefront OBJ; vertex colours as the three extra numbers that MeshLab, Blender and trimesh read; a texture beside
-    it."""
+    """Wavefront OBJ of vertices [V, 3], faces [F, 3]; vertex colours [V, 3] as the three extra numbers that MeshLab,
+    Blender and trimesh read; a texture beside it."""
     rows = vertices if colours is None else np.c_[vertices, colours / 255]
     form = "v " + " ".join(["%.7g"] * 3 + (["%.4f"] * 3 if colours is not None else []))
     with open(path, "w") as file:

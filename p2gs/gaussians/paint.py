@@ -74,9 +74,9 @@ def draw(
             g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh, camera.viewmat, camera.K,
             camera.width, camera.height, background=colour, backend=backend, **options,
         )  # fmt: skip
-    return RenderOutput(
-        **{f.name: v.cpu() if isinstance(v := getattr(out, f.name), Tensor) else v for f in fields(out)}
-    )
+    values = ((f.name, getattr(out, f.name)) for f in fields(out))
+    here: dict[str, Any] = {name: v.cpu() if isinstance(v, Tensor) else v for name, v in values}
+    return RenderOutput(**here)
 
 
 def to_image(colour: Tensor) -> np.ndarray:
@@ -85,7 +85,8 @@ def to_image(colour: Tensor) -> np.ndarray:
 
 
 def part_coloured(g: GaussianTensors, part_ids: Tensor, shading: float = 0.6) -> GaussianTensors:
-    """The same Gaussians in their parts' colours, keeping some of their own lightness so that shape stays readable."""
+    """The same Gaussians in the colours of their parts (part_ids [N]), keeping some of their own lightness so that
+    shape stays readable."""
     luma = dc_to_rgb(g.sh[:, 0]).clamp(0, 1) @ g.sh.new_tensor([0.299, 0.587, 0.114])
     palette = part_colours(int(part_ids.max()) + 1 if len(part_ids) else 1).to(g.sh)
     colour = palette[part_ids] * (1 - shading + shading * luma.clamp_min(0.15).sqrt()[:, None] * 1.15)

@@ -69,7 +69,8 @@ def _read_camera(row: dict) -> NamedCamera:
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor, width: int, height: int, focal: float) -> Camera:
-    """An OpenCV camera at ``eye`` looking at ``target``; focal in pixels, principal point in the middle."""
+    """An OpenCV camera at ``eye`` [3] looking at ``target`` [3], ``up`` [3] upwards; focal in pixels, principal point
+    in the middle."""
     z = torch.nn.functional.normalize(target - eye, dim=0)
     x = torch.linalg.cross(z, up)
     if x.norm() < 1e-6:  # straight up or down: any side will do

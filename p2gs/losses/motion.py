@@ -55,8 +55,8 @@ def carried(transforms: Tensor, points: Tensor) -> Tensor:
 
 
 def squared(residual: Tensor, robust: float | None, extent: float, dim: int = -1) -> Tensor:
-    """|r|^2 over dimension ``dim``; with ``robust`` (a fraction of the extent) Geman-McClure's s^2 r^2 / (s^2 +
-    r^2)."""
+    """|r|^2 of [...] over dimension ``dim``, which goes; with ``robust`` (a fraction of the extent) Geman-McClure's s^2
+    r^2 / (s^2 + r^2)."""
     sq = residual.square().sum(dim)
     if robust is None:
         return sq

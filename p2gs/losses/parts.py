@@ -14,7 +14,7 @@ TINY = 1e-12
 
 
 def sample_rows(total: int, sample: int, step: int, device=None) -> Tensor | slice:
-    """``sample`` distinct row numbers out of ``total``, a function of the step alone; all rows where sample is 0 or not
+    """Distinct row numbers [sample] out of ``total``, a function of the step alone; all rows where sample is 0 or not
     smaller."""
     if sample <= 0 or sample >= total:
         return slice(None)

@@ -103,7 +103,7 @@ def majority(labels: Tensor, neighbours: Tensor, weights: Tensor, parts: int) ->
 
 
 def clean_labels(g: GaussianTensors, labels: Tensor, parts: int, k: int) -> Tensor:
-    """Labels by the opacity-weighted majority of the k nearest Gaussians, each counting itself twice."""
+    """Labels [N] by the opacity-weighted majority of the k nearest Gaussians, each counting itself twice."""
     if k <= 0 or len(labels) <= k:
         return labels
     _, index = knn(g.means, None, k, True)
@@ -113,7 +113,7 @@ def clean_labels(g: GaussianTensors, labels: Tensor, parts: int, k: int) -> Tens
 
 
 def surviving_slots(learned: Articulation, labels: Tensor, config: FinishConfig) -> list[int]:
-    """Movable slots with mass and motion, as slot numbers."""
+    """Movable slots with mass and motion, as slot numbers; labels [N]."""
     solid = torch.sigmoid(learned.gaussians.opacity_logits) > 0.5
     alive = []
     for k in range(1, len(learned.types) + 1):
@@ -133,9 +133,9 @@ def surviving_slots(learned: Articulation, labels: Tensor, config: FinishConfig)
 def state_labels(
     learned: Articulation, labels: Tensor, state: StateGaussians, transforms: Tensor, k: int = 6
 ) -> tuple[Tensor, Tensor]:
-    """Labels of a single-state reconstruction by the twin posed in that state; margin = how far the majority exceeds
-    the rest, 0..1, or -1 for what the twin has nothing near of (lids that gave way to walls): the polish leaves that
-    out."""
+    """Labels [M] of a single-state reconstruction by the twin posed in that state; margin = how far the majority
+    exceeds the rest, 0..1, or -1 for what the twin has nothing near of (lids that gave way to walls): the polish leaves
+    that out."""
     posed = carry(
         learned.gaussians, labels, se3.screw_at(with_static(transforms), state.state - learned.canonical_time)
     )
@@ -149,7 +149,7 @@ def state_labels(
 
 
 def name_types(types: list[str], transforms: Tensor, below: float) -> list[str]:
-    """Give every "free" motion a joint type by its angle."""
+    """Give every "free" motion a joint type by its angle; transforms [K, 4, 4]."""
     angle = so3.rotation_angle(transforms[:, :3, :3]) * 57.29578 if len(transforms) else []
     return [
         ("prismatic" if float(a) < below else "revolute") if t == "free" else t
@@ -158,7 +158,8 @@ def name_types(types: list[str], transforms: Tensor, below: float) -> list[str]:
 
 
 def constrain(kind: str, T: Tensor, centre: Tensor) -> Tensor:
-    """The nearest motion of a joint type: a slide carries ``centre`` where T does, a turn loses its pitch."""
+    """The nearest motion [4, 4] of a joint type: a slide carries ``centre`` [3] where T does, a turn loses its
+    pitch."""
     if kind == "prismatic":
         out = torch.eye(4, dtype=T.dtype)
         out[:3, 3] = T[:3, :3] @ centre + T[:3, 3] - centre

@@ -82,7 +82,7 @@ def depth_points(views, count: int, generator: torch.Generator) -> tuple[Tensor,
 
 
 def isotropic_gaussians(points: Tensor, colours: Tensor, opacity: float, sh_degree: int) -> GaussianTensors:
-    """Round Gaussians as large as the mean distance to their three nearest neighbours."""
+    """Round Gaussians at points [N, 3], as large as the mean distance to their three nearest neighbours."""
     from p2gs.ops.knn import knn
     from p2gs.ops.sh import rgb_to_dc
 

@@ -96,8 +96,8 @@ def write_registration(path: Path, found: Registration, states: list[StateGaussi
 
 
 def read_registration(path: Path) -> tuple[Registration, dict[tuple[int, str], tuple[Tensor, Tensor]]]:
-    """What ``write_registration`` kept: the end's, and motion and gain by state and name of a photograph; nothing
-    without a file."""
+    """What ``write_registration`` kept: the end's, and motion [4, 4] and gain [3] by state and name of a photograph;
+    nothing without a file."""
     if not path.is_file():
         return Registration(torch.eye(4, dtype=torch.float64), torch.zeros(3)), {}
     stored = json.loads(path.read_text())

@@ -194,6 +194,7 @@ def fit_camera(g: GaussianTensors, shot: TargetImage, half: Tensor, config: View
 
 
 def half_error(g: GaussianTensors, shot: TargetImage, half: Tensor, twist: Tensor, backend: str) -> Tensor:
+    """Image loss, a scalar, over the pixels of ``half`` [H, W] under the camera moved by ``twist`` [6]."""
     camera = replace(shot.camera, viewmat=(shot.camera.viewmat.double().cpu() @ se3.exp(twist)).to(shot.camera.viewmat))
     out = render_gaussians(g, camera, torch.full((3,), GREY).to(g.means), backend=backend)
     return l1_ssim(shot.image + half[..., None] * (out.colour - shot.image), shot.image, STRUCTURE)

@@ -30,7 +30,7 @@ def soft_assignment(psi: Tensor, weight: Tensor, bias: Tensor, temperature: floa
 
 
 def soft_assignment_reference(psi: Tensor, weight: Tensor, bias: Tensor, temperature: float = 1.0) -> Tensor:
-    """``soft_assignment`` written for reading: any floating dtype and device."""
+    """``soft_assignment``, its shapes too, written for reading: any floating dtype and device."""
     # parts first: a softmax over a short last dimension is several times slower
     return torch.softmax((weight @ psi.T + bias[:, None]) / temperature, dim=0).T
 

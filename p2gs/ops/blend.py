@@ -97,7 +97,7 @@ class _PartMotions(torch.autograd.Function):
 
 
 def blend_move_reference(means: Tensor, quats: Tensor, probs: Tensor, twists: Tensor) -> tuple[Tensor, Tensor]:
-    """``blend_move`` written for reading: any floating dtype and device."""
+    """``blend_move``, its shapes too, written for reading: any floating dtype and device."""
     motions = torch.cat([torch.eye(4).to(twists)[None], se3.exp(twists)])
     rows = (probs @ motions[:, :3].flatten(1)).unflatten(1, (3, 4))
     moved = (rows[:, :, :3] * means[:, None, :]).sum(-1) + rows[:, :, 3]

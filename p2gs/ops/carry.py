@@ -69,7 +69,7 @@ def carry(means: Tensor, quats: Tensor, sh: Tensor, parts: Parts, transforms: Te
 def carry_reference(
     means: Tensor, quats: Tensor, sh: Tensor, parts: Parts, transforms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``carry`` in torch, on any device."""
+    """``carry``, its shapes too, in torch, on any device."""
     transforms = torch.cat([torch.eye(4).to(means)[None], transforms.to(means)])
     T = transforms[parts.labels]
     means = torch.einsum("nij,nj->ni", T[:, :3, :3], means) + T[:, :3, 3]

@@ -61,7 +61,7 @@ def knn(points: Tensor, queries: Optional[Tensor], k: int, exclude_self: bool = 
 def knn_reference(
     points: Tensor, queries: Optional[Tensor], k: int, exclude_self: bool = False, block: int = 4_000_000
 ) -> tuple[Tensor, Tensor]:
-    """``knn`` by all distances, ``block`` of them at a time: any dtype and device."""
+    """``knn``, its shapes too, by all distances, ``block`` of them at a time: any dtype and device."""
     queries = points if queries is None else queries.to(points)
     rows = max(1, block // points.shape[0])
     found = []

@@ -81,7 +81,7 @@ def hidden_bends_reference(
     contrast: float,
     noise: float,
 ) -> Optional[Tensor]:
-    """``hidden_bends`` written for reading: any floating dtype and device."""
+    """``hidden_bends``, its shapes too, written for reading: any floating dtype and device."""
     inside = (target_alpha > COVERED) & (alpha.detach() > SOLID)
     depth = torch.where(inside, depth / alpha.clamp_min(SOLID), torch.ones_like(depth)).clamp_min(1e-3)
     total, count = depth.new_zeros(()), 0

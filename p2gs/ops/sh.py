@@ -39,7 +39,7 @@ def rgb_to_dc(rgb: Tensor) -> Tensor:
 
 
 def dc_to_rgb(dc: Tensor) -> Tensor:
-    """Inverse of ``rgb_to_dc`` (not clamped)."""
+    """Inverse of ``rgb_to_dc``, [..., 3] to [..., 3] (not clamped)."""
     return dc * C0 + 0.5
 
 

@@ -121,7 +121,7 @@ def _statistics(cache, key, target: Tensor) -> tuple[bool, Tensor]:
 
 
 def gaussian_window(dtype=torch.float32, device=None) -> Tensor:
-    """The 11 weights of the separable window, sigma 1.5, sum 1."""
+    """The weights of the separable window, [11], sigma 1.5, sum 1."""
     x = torch.arange(11, dtype=torch.float64) - 5
     g = torch.exp(-(x**2) / (2 * 1.5**2))
     return (g / g.sum()).to(dtype=dtype, device=device)

@@ -57,7 +57,7 @@ def rigid_between(own: np.ndarray, other: np.ndarray, with_scale: bool) -> np.nd
 
 
 def moved_joint(joint: Joint, T: np.ndarray) -> Joint:
-    """A joint after the similarity T."""
+    """A joint after the similarity T, [4, 4]."""
     scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
     R = torch.tensor(T[:3, :3] / scale)
     origin = scale * (R @ joint.origin.double()) + torch.tensor(T[:3, 3])

@@ -116,7 +116,10 @@ def scene_folder(run_dir: Path) -> Path:
     path = Path(run_dir) / "config.yaml"
     if not path.is_file():
         raise UserError(f"{path} is missing, so the scene of this run is not known")
-    return Path(load_config([str(path)], []).data.root)
+    root = load_config([str(path)], []).data.root
+    if root is None:
+        raise UserError(f"{path}: the scene of this run lies in no folder (data.root is null)")
+    return Path(root)
 
 
 def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]) -> dict:
@@ -135,8 +138,9 @@ def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]
         for view in views:
             quality.update(draw(gaussians, view.camera, 0.0), view, diagonal)
         out[name] = {"split": split, "count": len(views)} | quality.means()
-    if out and lpips_wanted() and why_absent() is not None:
-        missing.append(why_absent())
+    why = why_absent() if out and lpips_wanted() else None
+    if why is not None:
+        missing.append(why)
     if out and not any("depth_median" in s for s in out.values()):
         missing.append("the scene has no depth maps")
     both = [{k: v for k, v in s.items() if k not in ("split", "count")} for s in out.values()]

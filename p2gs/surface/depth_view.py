@@ -68,6 +68,7 @@ def add_normals(view: DepthView, edge: float) -> DepthView:
 
 def seen_points(view: DepthView, part: int, start_to_world: Tensor, stride: int = 1) -> Tensor:
     """Where the view saw the part, in the part's start-state coordinates, [M, 3] float64."""
+    assert view.cosine is not None  # of add_normals
     mask = (view.labels == part) & (view.cosine > 0)
     if stride > 1:
         keep = torch.zeros_like(mask)

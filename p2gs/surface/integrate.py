@@ -58,7 +58,7 @@ def integrate(
 def integrate_reference(
     points: Tensor, views: Sequence[DepthView], matrices: Sequence[Tensor], part: int, trunc: float, behind: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``integrate`` in torch, in the dtype of ``points``."""
+    """``integrate``, its shapes too, in torch, in the dtype of ``points``."""
     maps = [_pixel_table(v, part).to(points) for v in views]
     matrices = [M.to(points) for M in matrices]
     chunks = points.split(CHUNK)  # small enough to stay in cache through all views

@@ -67,7 +67,7 @@ def part_meshes(
             continue
         space = (seen.views, seen.poses[k], voxel)
         tray = None if base is None else seen.tray(k, meshes[k], meshes[base])
-        if tray is not None:
+        if tray is not None and base is not None:
             meshes[k] = complete_tray(meshes[k], tray, *space, TRUNCATION * voxel)
             meshes[base] = clear_way(meshes[base], tray, voxel)
             for j in (j for j, p in enumerate(obj.parts) if p.joint is not None and j != k and len(meshes[j].faces)):

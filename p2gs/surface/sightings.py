@@ -131,6 +131,7 @@ def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolut
     views = []
     for seen, (_, camera) in zip(looks, cameras, strict=True):
         view = add_normals(DepthView(camera, seen.depth, seen.label, seen.colour), edge=EDGE * voxel)
+        assert view.cosine is not None  # of add_normals
         view.cosine = view.cosine * trust(seen, limit) * ~beside_others(seen.label)
         views.append(view)
     motions = [[start_motion(obj, k, 0.0), start_motion(obj, k, 1.0)] for k in range(len(obj.parts))]

@@ -121,6 +121,7 @@ def fill_pinholes(
     field: np.ndarray, known: np.ndarray, enough: float = 14 / 27, rounds: int = 2
 ) -> tuple[np.ndarray, np.ndarray]:
     """Give unknown voxels that most neighbours surround (at least ``enough`` of the 3^3 cube) the known ones' mean.
+    field, known: [X, Y, Z].
 
     Beyond the rim of an open surface a voxel has at most 9 known neighbours, so openings do not shrink.
     """

@@ -64,8 +64,8 @@ def close_unseen_sides(
     """The mesh with planes on the unseen sides of its box, sewn to its open edges and coloured as the seen surface
     nearest to them.
 
-    mesh, poses: start-state coordinates of the part (its number in ``views``).  voxel: of the mesh.  clearance: as in
-    ``seen_empty``.
+    mesh, poses ([4, 4] each): start-state coordinates of the part (its number in ``views``).  voxel: of the mesh.
+    clearance: as in ``seen_empty``.
     """
     if len(mesh.faces) == 0:
         return mesh
@@ -103,7 +103,7 @@ def _touching(area: np.ndarray, seen: np.ndarray) -> float:
     """Share of the rim of an area [a, b] bool at or beside which there is seen surface [a, b] bool."""
     from scipy.ndimage import binary_dilation, binary_erosion
 
-    rim = area & ~binary_erosion(area)
+    rim = area & ~np.asarray(binary_erosion(area), dtype=bool)
     return float(binary_dilation(seen)[rim].mean()) if rim.any() else 0.0
 
 

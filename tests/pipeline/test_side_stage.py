@@ -2,24 +2,21 @@
 lost process."""
 
 import json
-import os
 import signal
 import subprocess
-import sys
 import time
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from one_stage import REPO, command, environment
 
 from p2gs.callbacks.base import Callback, register_callback
 from p2gs.config.run import load_config
 from p2gs.gaussians import handover
 from p2gs.runtime.side_stage import SideStage, can_run_beside
 from p2gs.types import UserError
-
-REPO = Path(__file__).parents[2]
 
 STATES = """
 include: [{repo}/configs/preset/smoke.yaml]
@@ -34,27 +31,6 @@ def config(folder: Path, steps: int = 60) -> Path:
     path = folder / f"states_{steps}.yaml"
     path.write_text(STATES.format(repo=REPO, root=folder / "scene", steps=steps))
     return path
-
-
-def command(config: Path, run: Path, threads: int) -> list[str]:
-    return [
-        sys.executable,
-        "-m",
-        "p2gs",
-        "fit",
-        "-c",
-        str(config),
-        "--run",
-        str(run),
-        "--only",
-        "single_state",
-        "--threads",
-        str(threads),
-    ]
-
-
-def environment() -> dict:
-    return {**os.environ, "OMP_WAIT_POLICY": "passive", "PYTHONPATH": str(REPO)}
 
 
 def test_both_states_at_once_give_the_bits_of_one_after_the_other(tmp_path):

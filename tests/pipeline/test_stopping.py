@@ -6,15 +6,13 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 import torch
+from one_stage import REPO, command, environment
 
 from p2gs.run_lock import locked
 from p2gs.types import UserError
-
-REPO = Path(__file__).parents[2]
 
 STATES = """
 include: [preset/smoke.yaml]
@@ -29,22 +27,9 @@ callbacks: {{checkpoint: {{every: 5}}}}
 def test_sigterm_saves_the_step_and_says_that_the_run_is_not_done(tmp_path):
     config, run = tmp_path / "states.yaml", tmp_path / "run"
     config.write_text(STATES.format(root=tmp_path / "scene"))
-    command = [
-        sys.executable,
-        "-m",
-        "p2gs",
-        "fit",
-        "-c",
-        str(config),
-        "--run",
-        str(run),
-        "--only",
-        "single_state",
-        "--threads",
-        "1",
-    ]
-    environment = {**os.environ, "PYTHONPATH": str(REPO), "OMP_WAIT_POLICY": "passive"}
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+    process = subprocess.Popen(
+        command(config, run, 1), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment()
+    )
     saved = run / "checkpoints" / "single_state_0.ckpt"
     deadline = time.time() + 200
     while not saved.exists() and process.poll() is None and time.time() < deadline:

@@ -39,6 +39,7 @@ def run_job(task: str, job: dict, folder: Path, progress: Callable[[str], None] 
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True) as child,
     ):
         try:
+            assert child.stdout is not None  # a pipe
             for line in child.stdout:
                 progress(line.strip())
         except KeyboardInterrupt:

@@ -124,7 +124,7 @@ class Splat:
 
 
 def initial(region: Region, xyz: np.ndarray, rgb: np.ndarray, seed: int = 0) -> Splat:
-    """The Gaussians to start from. xyz, rgb: the model's points."""
+    """The Gaussians to start from. xyz, rgb: the model's points, [M, 3]."""
     cloud = _cloud(region, torch.Generator().manual_seed(seed))
     grids = [g[region.free(g + 0.02 * region.distance * p[:3]) | (p[2] > 0.9)]
              for p in region.planes for g in [_plane_grid(p, region)]]  # fmt: skip

@@ -134,7 +134,9 @@ def _points_bin(path: Path):
     for _ in range(file.take("Q")[0]):
         key, x, y, z, r, g, b, _, length = file.take("Q3d3BdQ")
         file.array("<i4", 2 * length)
-        ids.append(key), xyz.append((x, y, z)), rgb.append((r, g, b))
+        ids.append(key)
+        xyz.append((x, y, z))
+        rgb.append((r, g, b))
     return np.array(ids, np.int64), np.array(xyz, float).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3)
 
 

@@ -67,8 +67,8 @@ def floor_of(model: Model, seed: int = 0) -> Floor:
     if best is None or most < MIN_SHARE * len(points):
         return Floor(up, float(np.quantile(heights, 0.02)) if len(heights) else 0.0, "cameras")
     normal, offset = fit_plane(low[best])
-    sign = np.sign(normal @ up)
-    return Floor(normal * sign, offset * sign, "floor plane")
+    sign = float(np.sign(normal @ up))
+    return Floor(normal * sign, float(offset * sign), "floor plane")
 
 
 def to_world(floor: Floor, model: Model, metres_per_unit: float) -> np.ndarray:

@@ -45,7 +45,7 @@ def read_mask(path: Path, shot: Shot, ignore: bool) -> np.ndarray:
     if mask.ndim == 3:
         mask = mask[..., 3] if mask.shape[2] == 4 and not ignore else mask[..., :3].max(2)
     if mask.dtype == np.uint16:
-        mask = (mask >> 8).astype(np.uint8)
+        mask = np.right_shift(mask, 8, dtype=np.uint16).astype(np.uint8)
     elif mask.max() == 1:
         mask = mask * 255
     height, width = mask.shape
@@ -60,12 +60,20 @@ def read_mask(path: Path, shot: Shot, ignore: bool) -> np.ndarray:
 
 
 def alpha_masks(shots: list[Shot], folder: Path) -> dict[str, np.ndarray] | None:
-    """The photographs' own alpha by name, or None unless all have one."""
+    """The photographs' own alpha by name, [H, W] uint8, or None unless all have one. Raises UserError for a file that
+    is no image."""
     import cv2
 
-    if not all(s.alpha for s in shots):
+    files = {s.name: folder / s.alpha for s in shots if s.alpha}
+    if len(files) < len(shots):
         return None
-    return shown({s.name: cv2.imread(str(folder / s.alpha), cv2.IMREAD_GRAYSCALE) for s in shots}, folder)
+    masks = {}
+    for name, path in files.items():
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if mask is None:
+            raise UserError(f"{path}: cannot be read as an image")
+        masks[name] = mask
+    return shown(masks, folder)
 
 
 def folder_masks(shots: list[Shot], folder: Path, ignore: bool = False) -> dict[str, np.ndarray]:

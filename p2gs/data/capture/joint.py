@@ -67,7 +67,8 @@ def guided_pairs(start: State, end: State, T: np.ndarray) -> np.ndarray:
 
 
 def merged(start: Model, end: Model, T: np.ndarray, pairs: np.ndarray) -> Model:
-    """One model in the start's frame. pairs: rows of start's and end's points that are one.
+    """One model in the start's frame. T: [4, 4] start -> end.  pairs: [M, 2] rows of start's and end's points that are
+    one.
 
     Photographs of the end state that share device and size with the start's share its lens from here on.
     """
@@ -157,6 +158,7 @@ def join(
         model = filtered(adjusted(model, folder, False, progress))
         if turn + 1 < ROUNDS:
             T = _relative(model, start.model, end.model)
+    assert model is not None  # there is at least one round
     return filtered(adjusted(model, folder, True, progress))
 
 

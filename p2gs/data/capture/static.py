@@ -22,7 +22,7 @@ ADVICE = (
 
 
 def apart(model: Model, A: np.ndarray, B: np.ndarray) -> float:
-    """How far two similarities start -> end put the object's surroundings apart, over the cameras' distance."""
+    """How far two similarities [4, 4] start -> end put the object's surroundings apart, over the cameras' distance."""
     centre, distance = model.centre()
     offsets = np.vstack([np.zeros(3), 0.3 * distance * np.eye(3), -0.3 * distance * np.eye(3)])
     points = centre + offsets

@@ -117,7 +117,7 @@ class SyntheticObject:
 
 
 def concatenate(meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Several (vertices, faces) as one."""
+    """Several (vertices [V, 3], faces [F, 3]) as one."""
     offsets = np.cumsum([0] + [len(v) for v, _ in meshes[:-1]])
     return np.concatenate([v for v, _ in meshes]), np.concatenate(
         [f + o for (_, f), o in zip(meshes, offsets, strict=True)]

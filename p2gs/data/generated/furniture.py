@@ -247,10 +247,16 @@ def _fill(rng: np.random.Generator, palette: Palette, cell: Cell, drawers: float
 
 
 def _storage(
-    rng: np.random.Generator, name: str, columns: list[int], drawers: float, size, open_cells: int = 0
+    rng: np.random.Generator,
+    name: str,
+    columns: list[int],
+    drawers: float,
+    size: tuple[float, float, float],
+    open_cells: int = 0,
 ) -> SyntheticObject:
     palette = Palette(rng)
-    boards, cells = carcass(rng, palette, *size, columns)
+    depth, width, height = size
+    boards, cells = carcass(rng, palette, depth, width, height, columns)
     left_open = (
         set(rng.choice(len(cells), min(open_cells, len(cells) - 1), replace=False).tolist()) if open_cells else set()
     )
@@ -317,6 +323,7 @@ def nested_drawers(rng: np.random.Generator) -> SyntheticObject:
     boards, (cell,) = carcass(rng, palette, 0.9, rng.uniform(0.8, 1.0), rng.uniform(0.5, 0.65), [1])
     outer = drawer(rng, palette, cell, (0.0, rng.uniform(0.65, 0.85)))
     joint, back = outer.joint, outer.primitives[4]
+    assert joint is not None  # a drawer slides
     x0, y0, z1 = back.corners[:, 0].max(), back.corners[:, 1].min(), back.corners[:, 2].max()
     y1, length = back.corners[:, 1].max(), cell.x - back.corners[:, 0].max()
     lag = rng.uniform(0.0, 0.15) * length  # the tray stays behind, so that far it needs room at the drawer's back

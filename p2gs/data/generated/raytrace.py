@@ -108,13 +108,8 @@ class Shadow:
         uv = (p[:, :2] / p[:, 2:] / np.float32(self.reach) + 1) * np.float32(self.size / 2)
         x, y = (np.clip(uv[:, i].astype(np.int32), 2, self.size - 3) for i in (0, 1))
         z = p[:, 2] - np.float32(self.bias)
-        return (
-            sum(
-                (self.depth[y + j, x + i] >= z).astype(np.float32)
-                for i, j in ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2))
-            )
-            / 5
-        )
+        cross = ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2))
+        return np.sum([(self.depth[y + j, x + i] >= z).astype(np.float32) for i, j in cross], axis=0) / np.float32(5)
 
 
 def _shade(primitive: Primitive, p_local: np.ndarray, shadow: Optional[Shadow]) -> np.ndarray:

@@ -51,7 +51,7 @@ class Primitive:
         p = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         s = np.asarray(self.size) - slack
         if self.kind == "box":
-            return (np.abs(p) < s).all(axis=1)
+            return np.all(np.abs(p) < s, axis=1)
         if self.kind == "cylinder":
             return (np.hypot(p[:, 0], p[:, 1]) < s[0]) & (np.abs(p[:, 2]) < s[2])
         return np.linalg.norm(p, axis=1) < s[0]
@@ -126,6 +126,7 @@ def hit_interval(kind: Kind, size, o: np.ndarray, d, inv, inv_abs) -> tuple[np.n
         hi[disc <= 0] = -1
         near = lo if near is None else np.maximum(near, lo)
         far = hi if far is None else np.minimum(far, hi)
+    assert near is not None and far is not None  # a shape has axes or is round
     return near, far
 
 

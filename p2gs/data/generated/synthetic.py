@@ -53,7 +53,7 @@ def look_at(position: np.ndarray, target=(0.0, 0.0, 0.0)) -> np.ndarray:
 
 
 def train_cameras(count: int, seed: int) -> list[np.ndarray]:
-    """Viewmats on the upper hemisphere: a Fibonacci lattice, turned and jittered by the seed."""
+    """Viewmats [4, 4] on the upper hemisphere: a Fibonacci lattice, turned and jittered by the seed."""
     rng = np.random.default_rng([seed, 1])
     height = np.clip((np.arange(count) + rng.uniform(0.1, 0.9, count)) / count, 0.02, 0.985)
     azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi) + rng.normal(0, 0.1, count)
@@ -65,7 +65,7 @@ def train_cameras(count: int, seed: int) -> list[np.ndarray]:
 
 
 def test_cameras(count: int) -> list[np.ndarray]:
-    """Viewmats on a ring at 30 degrees."""
+    """Viewmats [4, 4] on a ring at 30 degrees."""
     e, azimuth = np.deg2rad(TEST_ELEVATION), 2 * np.pi * (np.arange(count) + 0.5) / max(count, 1)
     return [look_at(RADIUS * np.array([np.cos(e) * np.cos(p), np.cos(e) * np.sin(p), np.sin(e)])) for p in azimuth]
 
@@ -78,7 +78,8 @@ def intrinsics(size: int) -> np.ndarray:
 def render_view(
     obj: SyntheticObject, state: int, split, name: str, viewmat: np.ndarray, size: int, shadow: Optional[Shadow] = None
 ) -> View:
-    """One view of a state, with exact depth. shadow: of this state, or None for an object that casts none."""
+    """One view of a state, with exact depth. viewmat: [4, 4].  shadow: of this state, or None for an object that casts
+    none."""
     K = intrinsics(size)
     primitives, parts = obj.posed(float(state))
     r = render(primitives, parts, viewmat, K, size, size, shadow=shadow)

@@ -28,7 +28,7 @@ class Texture:
     def at(self, p: np.ndarray) -> np.ndarray:
         """[N, 3] float32 colours at local points p [N, 3] float32."""
         mix = np.clip(self._mix(p / np.float32(self.period)), 0, 1)[:, None]
-        a, b = np.float32(self.colour), np.float32(self.second)
+        a, b = np.array([self.colour, self.second], dtype=np.float32)
         return a + mix * (b - a)
 
     def _mix(self, p: np.ndarray) -> np.ndarray:

@@ -85,7 +85,9 @@ def write_ground_truth(obj: Drawn, folder: Path) -> None:
         dynamic = ["dynamic"] if len(joints) == 1 else [f"dynamic_{i}" for i in range(len(joints))]
         for name, (v, f) in zip(["static", *dynamic, None], [*parts, concatenate(parts)], strict=True):
             path = folder / state / f"{state}_{name + '_' if name else ''}rotate.ply"
-            path.write_bytes(trimesh.Trimesh(v, f, process=False).export(file_type="ply"))
+            content = trimesh.Trimesh(v, f, process=False).export(file_type="ply")
+            assert isinstance(content, bytes)  # PLY is
+            path.write_bytes(content)
 
 
 def shared_K(views: Sequence[View], layout: str) -> np.ndarray:

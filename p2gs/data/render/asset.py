@@ -122,7 +122,7 @@ def euler(angles, order: str) -> np.ndarray:
 
 
 def unit(axis: np.ndarray, where: str) -> np.ndarray:
-    """Raises UserError for an axis without length."""
+    """The vector [3] at length 1. Raises UserError for an axis without length."""
     length = float(np.linalg.norm(axis))
     if not np.isfinite(length) or length < 1e-9:
         raise UserError(f"{where}: the axis {np.round(axis, 9).tolist()} has no direction")

@@ -164,5 +164,5 @@ def _linear(colour: np.ndarray) -> np.ndarray:
 
 
 def srgb(light: np.ndarray) -> np.ndarray:
-    """Light in 0..1 encoded (IEC 61966-2-1)."""
+    """Light in 0..1 encoded (IEC 61966-2-1), an array of any shape."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)

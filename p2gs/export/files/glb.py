@@ -66,19 +66,19 @@ def glb_bytes(asset: Asset) -> bytes:
     """The file's content."""
     buffer = Buffer()
     meshes = [_mesh(buffer, link) for link in asset.links]
-    textured = [link for link in asset.links if link.texture is not None]
+    textured = [(link.name, link.texture) for link in asset.links if link.texture is not None]
     document: dict = {}
     if textured:  # read between texels, but from no smaller copies, in which neighbours run together
         images = [
-            {"bufferView": buffer.add_bytes(link.texture.png()), "mimeType": "image/png", "name": link.name}
-            for link in textured
+            {"bufferView": buffer.add_bytes(texture.png()), "mimeType": "image/png", "name": name}
+            for name, texture in textured
         ]
         document |= {"images": images, "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR}]}
         document["textures"] = [{"source": i, "sampler": 0} for i in range(len(images))]
-    number = {link.name: i for i, link in enumerate(textured)}
+    number = {name: i for i, (name, _) in enumerate(textured)}
     for mesh in meshes:
         mesh["primitives"][0]["material"] = number.get(mesh["name"], len(textured))
-    document["materials"] = [_material(link.name, i) for i, link in enumerate(textured)]
+    document["materials"] = [_material(name, i) for i, (name, _) in enumerate(textured)]
     if len(textured) < len(asset.links):
         document["materials"].append(_material("scan"))
     return animated_glb(asset, buffer, meshes, document)
@@ -149,7 +149,7 @@ def _mesh(buffer: Buffer, link: Link) -> dict:
 
 
 def linear_light(srgb: np.ndarray) -> np.ndarray:
-    """Colours in 0..1 as pictures have them, in the linear light that glTF's vertex colours are."""
+    """Colours [..., 3] in 0..1 as pictures have them, in the linear light that glTF's vertex colours are."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime
 import re
 from pathlib import Path
-from typing import Mapping, Optional
+from typing import Any, Mapping, Optional
 
 import numpy as np
 
@@ -39,7 +39,7 @@ def write_simready(
         "mass": sum(link.inertia.mass for link in asset.links),
     }
     told = known | dict(meta) | {"asset_name": name}
-    data = {"SimReady_Metadata": told | facts} | {key: told[key] for key in known}
+    data: dict[str, Any] = {"SimReady_Metadata": told | facts} | {key: told[key] for key in known}
     labels = [("class", str(told["category"]))] if "category" in told else []
     if "qcode" in told:
         labels.append(("wikidata_qcode", str(told["qcode"])))

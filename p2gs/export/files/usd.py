@@ -225,7 +225,7 @@ def _joint(link: Link, base: str) -> list[str]:
 
 
 def x_to(hinge: Hinge) -> np.ndarray:
-    """Quaternion wxyz that turns the x axis into the joint's (USD joints have a coordinate axis and a frame)."""
+    """Quaternion wxyz [4] that turns the x axis into the joint's (USD joints have a coordinate axis and a frame)."""
     x = hinge.axis
     w = 1 + x[0]
     q = np.array([w, 0, -x[2], x[1]]) if w > 1e-9 else np.array([0.0, 0, 0, 1])

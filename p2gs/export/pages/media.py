@@ -55,7 +55,7 @@ def render_plain(obj: ArticulatedObject, camera: Camera, t: float) -> np.ndarray
 
 
 def render_parts(obj: ArticulatedObject, camera: Camera, t: float, joints: bool = True) -> np.ndarray:
-    """The twin at state t in part colours over white, joints drawn in."""
+    """The twin at state t in part colours over white, joints drawn in, uint8 [H, W, 3]."""
     out = draw(part_coloured(pose(obj, t), obj.part_ids), camera)
     image = to_image(out.colour)
     return draw_joints(image, obj, camera, t, out.expected_depth, out.alpha) if joints else image
@@ -110,7 +110,7 @@ CAPTION, GAP = 26, 6
 
 
 def captioned(image: np.ndarray, text: str) -> np.ndarray:
-    """The image with a white line of text above it."""
+    """The image [H, W, 3] with a white line of text above it."""
     import cv2
 
     bar = np.full((CAPTION, image.shape[1], 3), 255, np.uint8)
@@ -119,7 +119,7 @@ def captioned(image: np.ndarray, text: str) -> np.ndarray:
 
 
 def beside(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Images of one height in a row with white gaps."""
+    """Images [H, W_i, 3] of one height in a row with white gaps."""
     gap = np.full((images[0].shape[0], GAP, 3), 255, np.uint8)
     cells = [images[0]]
     for image in images[1:]:
@@ -128,7 +128,7 @@ def beside(images: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def fit(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Shrunk or grown to fit, centred on white."""
+    """An image [h, w, 3] shrunk or grown to fit, centred on white: [height, width, 3]."""
     scale = min(width / image.shape[1], height / image.shape[0])
     small = resize(image, max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     out = np.full((height, width, 3), 255, np.uint8)
@@ -153,6 +153,7 @@ def legend(obj: ArticulatedObject, width: int) -> np.ndarray:
 
 
 def resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """An image [h, w, 3] as [height, width, 3]."""
     import cv2
 
     shrink = width < image.shape[1]

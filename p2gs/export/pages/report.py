@@ -187,7 +187,7 @@ def read_scalars(folder: Path) -> dict[str, np.ndarray]:
 
 
 def chart(curves: dict[str, np.ndarray], width: int = 640, height: int = 180) -> str:
-    """Curves over steps on a logarithmic scale, as SVG. Values that are not positive are left out."""
+    """Curves [n, 2] (step, value) on a logarithmic scale, as SVG. Values that are not positive are left out."""
     curves = {k: v[(v[:, 1] > 0) & np.isfinite(v[:, 1])] for k, v in curves.items()}
     curves = {k: v for k, v in curves.items() if len(v) > 1}
     if not curves:

@@ -32,9 +32,9 @@ def view_section(run_dir: Path, obj: ArticulatedObject) -> str:
         f'data-part="{link.part}" aria-label="joint {link.part}"><output>0</output></label>'
         for link in asset.moving
     ]
-    full = [link for link in asset.links if link.splats is not None and len(link.splats)]
-    splats = [_embedded(spz_bytes(link.splats), "splats", f'data-node="{link.name}"') for link in full]
-    spark = resources.files("p2gs.export").joinpath("spark", "spark.js.gz").read_bytes()
+    full = [(link.name, link.splats) for link in asset.links if link.splats is not None and len(link.splats)]
+    splats = [_embedded(spz_bytes(gaussians), "splats", f'data-node="{name}"') for name, gaussians in full]
+    spark = resources.files("p2gs.export").joinpath("spark").joinpath("spark.js.gz").read_bytes()
     return (
         f'<h2>Move it</h2>\n<div class="views"><figure><canvas id="view" data-turn="{front(obj):.3f}" '
         'aria-label="the mesh in 3D"></canvas>'

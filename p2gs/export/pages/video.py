@@ -55,7 +55,7 @@ def write_video(folder: Path, frames: Sequence[np.ndarray], fps: int = FPS) -> l
 
 
 def write_gif(path: Path, frames: Sequence[np.ndarray], fps: int = FPS, width: int = 640) -> Path:
-    """An endless GIF of every second frame (Pillow comes with scikit-image)."""
+    """An endless GIF of every second frame, uint8 [H, W, 3] (Pillow comes with scikit-image)."""
     from PIL import Image
 
     h, w = frames[0].shape[:2]

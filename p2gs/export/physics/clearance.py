@@ -181,8 +181,9 @@ def without(piece: Piece, sweep: Piece, gap: float) -> list[Piece]:
         outside = [cut(rest, -n, -d) for n, d in planes]
         k = int(np.argmax([0.0 if p is None else p.volume for p in outside]))
         n, d = planes.pop(k)
-        if outside[k] is not None and _thickness(outside[k]) > gap:
-            out.append(outside[k])
+        largest = outside[k]
+        if largest is not None and _thickness(largest) > gap:
+            out.append(largest)
         rest = cut(rest, n, d)
     return out
 

@@ -66,8 +66,8 @@ def hull(points: np.ndarray, min_thickness: float) -> Piece:
 
 
 def outermost(points: np.ndarray) -> np.ndarray:
-    """Indices of the points that are the furthest out in some of ``CORNERS`` directions (a coarse hull), and of the
-    box's corners."""
+    """Indices of the points [N, 3] that are the furthest out in some of ``CORNERS`` directions (a coarse hull), and of
+    the box's corners."""
     i = np.arange(CORNERS) + 0.5
     polar, turn = np.arccos(1 - 2 * i / CORNERS), np.pi * (1 + 5**0.5) * i
     directions = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], 1)
@@ -78,7 +78,7 @@ def outermost(points: np.ndarray) -> np.ndarray:
 
 
 def spread(vertices: np.ndarray, count: int = POINTS) -> tuple[np.ndarray, float]:
-    """About ``count`` of the vertices, evenly over the surface, and their spacing: one vertex in each cell of a
+    """About ``count`` of the vertices [V, 3], evenly over the surface, and their spacing: one vertex in each cell of a
     grid."""
     lo, size = vertices.min(0), float(np.ptp(vertices, axis=0).max())
     cell = size / 400
@@ -184,7 +184,8 @@ def _directions(piece: Piece) -> np.ndarray:
 
 
 def cut(piece: Piece, normal: np.ndarray, offset: float) -> Optional[Piece]:
-    """What of a piece lies at normal . x <= offset: itself where that is all, None where it is nothing (or flat)."""
+    """What of a piece lies at normal . x <= offset, normal [3]: itself where that is all, None where it is nothing (or
+    flat)."""
     import trimesh
 
     above = piece.vertices @ normal - offset

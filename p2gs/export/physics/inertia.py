@@ -45,12 +45,12 @@ def inertia_of(pieces: list[Piece], density: float) -> Inertia:
 
 
 def joint_load(inertia: Inertia, axis: np.ndarray, kind: str) -> float:
-    """The part's weight; on a hinge times the distance of its centre of mass from the axis. N or N m."""
+    """The part's weight; on a hinge times the distance of its centre of mass from the axis [3]. N or N m."""
     arm = 1.0 if kind == "prismatic" else float(np.linalg.norm(np.cross(axis, inertia.center)))
     return GRAVITY * inertia.mass * arm
 
 
 def effective_inertia(inertia: Inertia, axis: np.ndarray) -> float:
-    """About a unit axis through the link's origin, kg m^2."""
+    """About a unit axis [3] through the link's origin, kg m^2."""
     arm = np.cross(axis, inertia.center)
     return float(axis @ inertia.matrix @ axis + inertia.mass * arm @ arm)
