@@ -38,18 +38,18 @@ class FinishConfig:
     screws frozen. min_mass: a slot with a smaller share of the solid Gaussians vanishes. min_motion: likewise one that
     moves its points by less (internal units).
     askew: share of the image loss that an axis which is askew to the object's directions must save against one
-    along them. prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a slide.
-    clean_neighbours: labels are the majority among this many neighbours at canonical time (0 = as learned).
-    islands: pieces of a part smaller than this share of its largest go to what they touch (0 = off). trays: views
-    of a state by which drawers' trays are found, what is in or on which goes with the drawer (0 = off). exports:
-    simulator formats written at the end of a fit, with meshes and report (empty: neither; `p2gs export` makes them
-    later). extend_range: joint limits go on beyond the observed motion until the part touches another one (half a
-    turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians whose majority
-    exceeds the rest by less are shown as such in the diagnosis (0..1). complete: meshes have guesses for what no
-    camera saw (undersides, drawers' trays, hidden middles). whole: the mesh of the whole is its parts "joined", or
-    a surface of its own, made "separate"ly from each state's views, as PARIS, DTA and ArtGS have it. cluster: for
-    meshes a moving part keeps only its largest DBSCAN cluster of Gaussians, this the radius (input units; 0 = off;
-    ArtGS cleans real scans so, with 0.05).
+    along them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less than this many
+    degrees is a slide. clean_neighbours: labels are the majority among this many neighbours at canonical time (0 =
+    as learned). islands: pieces of a part smaller than this share of its largest go to what they touch (0 = off).
+    trays: views of a state by which drawers' trays are found, what is in or on which goes with the drawer (0 =
+    off). exports: simulator formats written at the end of a fit, with meshes and report (empty: neither; `p2gs
+    export` makes them later). extend_range: joint limits go on beyond the observed motion until the part touches
+    another one (half a turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians
+    whose majority exceeds the rest by less are shown as such in the diagnosis (0..1). complete: meshes have guesses
+    for what no camera saw (undersides, drawers' trays, hidden middles). whole: the mesh of the whole is its parts
+    "joined", or a surface of its own, made "separate"ly from each state's views, as PARIS, DTA and ArtGS have it.
+    cluster: for meshes a moving part keeps only its largest DBSCAN cluster of Gaussians, this the radius (input
+    units; 0 = off; ArtGS cleans real scans so, with 0.05).
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0))

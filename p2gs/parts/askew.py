@@ -1,6 +1,6 @@
 """Joints that are askew to the object: where photographs hardly tell which way a part went (a shut drawer shows a
 plain front, and its border is a guess), its free axis ends degrees off, while the object's own directions are known to
-half a degree."""
+a degree."""
 
 from __future__ import annotations
 
@@ -15,16 +15,19 @@ from p2gs.motion.refine_motions import Judge
 from p2gs.parts.settle import relabelled
 
 WITHIN = 15.0  # degrees about a direction in which an axis is tried on it: as where parts are fitted (``snapped``)
-KNOWN = 0.5  # degrees to which directions are known; an axis that is nearer keeps what photographs say
+KNOWN = 1.0  # degrees to which directions are known; an axis that is nearer keeps what photographs say
 
 
 def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMotions, list[dict]]:
     """Each joint's axis that is askew to the directions of the object on the nearest of them, the rest refined, where
-    the energy rises by at most ``price``; with labels chosen anew where the judge has discovery's surfaces.
+    the energy rises by at most ``price`` (0, or no refinement: none is); with labels chosen anew where the judge has
+    discovery's surfaces.
 
     Returns the motions and what was tried: part, type, degrees off, energy before and after.
     """
     log: list[dict] = []
+    if price <= 0 or judge.config.steps <= 0:
+        return motions, log
     directions = directions_of(judge.states, motions.labels) if len(motions) else torch.zeros(0, 3)
     held = torch.full((len(motions), 3), math.nan, dtype=torch.float64)
     for k, kind in enumerate(motions.types):

@@ -30,7 +30,7 @@ class PartMotionsConfig:
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to
     nothing of it.
     askew: share of the image loss that an axis must save which is askew to the directions that the object has, against
-    one along them.
+    one along them (0: axes stay).
     """
 
     evidence_size: int = 200

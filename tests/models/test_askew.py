@@ -8,7 +8,7 @@ import torch
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.directions import axis_of, common_normal, directions_of, turned_onto
-from p2gs.motion.screw_polish import allowed_step, along_axes, apply_step
+from p2gs.motion.screw_polish import PolishConfig, allowed_step, along_axes, apply_step
 from p2gs.ops import se3
 from p2gs.parts.askew import lay_axes
 from p2gs.types import GaussianTensors
@@ -112,6 +112,7 @@ class Told:
     states: list
     best: torch.Tensor
     slope: float
+    config: PolishConfig
     found = None
 
     def __call__(self, motions):
@@ -134,14 +135,17 @@ def askew(degrees: float) -> PartMotions:
     [
         (5.0, 0.001, True),  # photographs hardly tell: half a hundredth is lost
         (5.0, 0.01, False),  # they do
-        (0.3, 0.001, False),  # directions are not known better than that
+        (0.8, 0.001, False),  # directions are not known better than that
         (25.0, 0.0, False),  # of another direction altogether
     ],
 )
 def test_an_axis_askew_is_laid_where_that_costs_next_to_nothing(degrees, slope, laid):
     motions = askew(degrees)
-    judge = Told([cube(0), cube(1)], axis_of("prismatic", motions.transforms[0]), slope)
+    judge = Told([cube(0), cube(1)], axis_of("prismatic", motions.transforms[0]), slope, PolishConfig())
     found, log = lay_axes(judge, motions, 0.01)
     off = degrees_between(axis_of("prismatic", found.transforms[0]), UP)
     assert off < 0.1 if laid else off == pytest.approx(degrees, abs=1e-4)
-    assert len(log) == (0.5 < degrees < 15)
+    assert len(log) == (1 < degrees < 15)
+    assert lay_axes(judge, motions, 0.0) == (motions, [])  # switched off
+    judge.config = PolishConfig(steps=0)
+    assert lay_axes(judge, motions, 0.01) == (motions, [])  # screws stay as they were learned
