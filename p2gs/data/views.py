@@ -134,13 +134,6 @@ class TrainingViews:
         """The cropped, scaled camera of a view without its pixels."""
         return self._stored[index][level].camera
 
-    def contrast(self, index: int, level: int) -> Tensor:
-        """[3] a background unlike the object in view ``index``: each channel 0 or 1, whichever is farther from the
-        object's mean."""
-        s = self._stored[index][level]
-        total = s.alpha.sum().clamp_min(1)
-        return (2 * s.colour.reshape(-1, 3).sum(0) < total).float()
-
     def get(self, index: int, level: int, background: Tensor) -> TargetImage:
         """View ``index`` at pyramid level ``level`` composited over ``background`` [3] (float32, 0..1): c + (1 - alpha)
         * background."""

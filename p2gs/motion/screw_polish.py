@@ -273,8 +273,7 @@ def photometric_cost(
     device: torch.device | str = "cpu",
 ) -> float:
     """Mean image loss of the moved Gaussians over ``count`` views spread over the training set: lower explains the
-    images better. Before a background unlike the object, so that an outline in the wrong place costs as much on a grey
-    object as on any.
+    images better.
 
     shown: weight of each pixel, as in ``Side``; what a pixel lacks of 1 costs ``hidden`` instead (None: all count
     alike).
@@ -283,8 +282,8 @@ def photometric_cost(
     means, quats, sh = body.moved(transforms)
     total, picked = 0.0, views.spread(count)
     for index in picked:
+        background = torch.full((3,), 0.5)
         size = views.levels.index(level)
-        background = views.contrast(index, size)
         shot = views.get(index, size, background)
         colour, target = (
             body.render(means, quats, sh, shot.camera, background, backend).colour,

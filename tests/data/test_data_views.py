@@ -244,14 +244,3 @@ def test_mask_bounds_and_farthest_cameras():
         and farthest_cameras(line, 3) == [0, 2, 3]
         and farthest_cameras(line, 9) == [0, 1, 2, 3]
     )
-
-
-@pytest.mark.parametrize("colour, unlike", [((0.9, 0.8, 0.7), (0, 0, 0)), ((0.2, 0.6, 0.1), (1, 0, 1))])
-def test_contrast_is_unlike_the_object(colour, unlike):
-    alpha = torch.zeros(20, 30)
-    alpha[5:15, 8:25] = 1
-    image = (torch.tensor(colour) * 255).to(torch.uint8).expand(20, 30, 3)
-    camera = Camera(torch.eye(4), torch.tensor([[30.0, 0, 15], [0, 30, 10], [0, 0, 1]]), 30, 20)
-    view = View("0", 0, "train", camera, image, (alpha * 255).to(torch.uint8))
-    views = TrainingViews([view], levels=(30,))
-    assert views.contrast(0, 0).tolist() == list(unlike)

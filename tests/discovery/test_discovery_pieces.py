@@ -272,11 +272,13 @@ def test_moved_surface_counts_alike_whichever_state_shows_it(stacked):
     problem = stacked[0]
     few = torch.zeros_like(problem.moved[0])
     few[problem.moved[0].nonzero()[:5, 0]] = True
-    drawn = resampled(replace(problem, moved=[few, problem.moved[1]]), 0)
+    drawn = resampled(replace(problem, moved=[few, problem.moved[1]]), 0, by_surface=True)
     assert len(drawn.samples[0]) == 5 and sum(float(w.sum()) for w in drawn.weights) == pytest.approx(2)
     trust = [float(t[m].mean()) for t, m in zip(problem.trust, (few, problem.moved[1]), strict=True)]
     expected = 5 * trust[0] / (int(problem.moved[1].sum()) * trust[1])
     assert float(drawn.weights[0].sum() / drawn.weights[1].sum()) == pytest.approx(expected, rel=0.1)
+    alike = resampled(replace(problem, moved=[few, problem.moved[1]]), 0)
+    assert [float(w.sum()) for w in alike.weights] == pytest.approx([1, 1])
     # a state that shows nothing is looked at where its fate is unknown
     none = resampled(replace(problem, moved=[torch.zeros_like(few), problem.moved[1]]), 0)
     assert len(none.samples[0]) and not problem.static[0][none.samples[0]].any()

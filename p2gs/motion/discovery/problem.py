@@ -26,7 +26,7 @@ class Problem:
     the search looks at.
 
     trust [N] per state, 0.1..1: how credible it is that a moved surfel moved; ``weights`` [P] per state: that of the
-    samples times the moved surface that each stands for, sum 2 over both states.
+    samples, sum 2 over both states (``resampled``).
     """
 
     config: DiscoveryConfig
@@ -191,12 +191,12 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
     return problem, figures
 
 
-def resampled(problem: Problem, seed: int) -> Problem:
-    """The problem with moved surfels drawn anew to look at (``samples``) and their weights: each surfel counts alike,
-    whichever state shows it.
+def resampled(problem: Problem, seed: int, by_surface: bool = False) -> Problem:
+    """The problem with moved surfels drawn anew to look at (``samples``) and their weights: both states count alike, or
+    ``by_surface`` each moved surfel does, whichever state shows it.
 
-    A state that shows next to nothing that moved (a drawer's front, before which the open drawer stands in the other
-    state) is looked at where its fate is unknown.
+    A state that shows next to nothing that moved (of a shut drawer the front alone, before which the open drawer stands
+    in the other state) is looked at where its fate is unknown.
     """
     g = torch.Generator().manual_seed(seed)
     samples, weights = [], []
@@ -205,7 +205,9 @@ def resampled(problem: Problem, seed: int) -> Problem:
         if len(index) < FEWEST:
             index = torch.nonzero(~problem.static[s])[:, 0]
         samples.append(index[spread_sample(problem.surfels[s].points[index], problem.config.samples, g)])
-        weights.append(problem.trust[s][samples[s]] * (len(index) / max(len(samples[s]), 1)))
+        weight = problem.trust[s][samples[s]]
+        total = float(weight.sum())
+        weights.append(weight * (len(index) / max(len(weight), 1) if by_surface else 1 / max(total, 1e-9)))
     total = sum(float(w.sum()) for w in weights)
     return replace(problem, samples=samples, weights=[2 * w / max(total, 1e-9) for w in weights])
 
