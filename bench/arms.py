@@ -1,6 +1,6 @@
 """What the articulation phase buys: arms of configs/bench/main_ablation.yaml that share all stages up to fusion.
 
-    python bench/arms.py OUT [RUN|SCENE...] [--threads N] [--zoo DIR]
+    python bench/arms.py OUT [RUN|SCENE...] [--objects NAME...] [--threads N] [--zoo DIR]
 
 RUN is a finished run of the default preset: its stages up to fusion are copied to OUT. Of a SCENE folder the first arm
 makes them. Articulation, the last stage and the scores are made in every arm by `p2gs bench`, which leaves finished
@@ -92,6 +92,7 @@ def axis_error(case: Case, transforms: torch.Tensor, types: list[str]) -> Option
     found: list[SimpleNamespace] = [
         joint_of(to_input(T.double(), case.similarity), kind) for T, kind in zip(transforms, types, strict=True)
     ]
+    assert case.truth is not None  # p2gs test has scored its joints
     metric.update(found, case.truth.joints)
     return metric.report.axis_angle_mean
 
@@ -172,18 +173,22 @@ def end_rows(arms: dict[str, dict[str, Arm]], names: list[str]) -> list[list[str
     return rows
 
 
-def tables(out: Path, zoo: Path) -> str:
-    names = finished(out)
+def tables(out: Path, zoo: Path, chosen: Optional[list[str]]) -> str:
+    """Of the chosen objects (None: all) that have a joint in some arm; those that have none are named below."""
+    names = [n for n in finished(out) if chosen is None or n in chosen]
     if not names:
         return f"{out}: no object has all of its arms"
     cases = {n: Case(folder(out, "full", n), zoo) for n in names}
     arms = {arm: {n: read_arm(folder(out, arm, n), cases[n]) for n in names} for arm in ARMS}
+    without = [n for n in names if all(arms[arm][n].joints[0] == 0 for arm in ARMS)]
+    names = [n for n in names if n not in without]
     axis = ["Arm", *names, "mean"]
     end = ["Arm", *names, "mean", "found / right", "relabelled, %", "turn", "slide", "CD movable", "PSNR"]
-    return "\n\n".join(
+    made = [
         table(head, rows, set(head) - {"Arm"})
         for head, rows in ((axis, axis_rows(arms, names)), (end, end_rows(arms, names)))
-    )
+    ]
+    return "\n\n".join([*made, *([f"No joint in any arm: {', '.join(without)}"] if without else [])])
 
 
 def main() -> int:
@@ -191,11 +196,12 @@ def main() -> int:
     parser.add_argument("out", type=Path)
     parser.add_argument("given", type=Path, nargs="*", metavar="RUN|SCENE")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--objects", nargs="+", help="of OUT, to be printed (default: all)")
     parser.add_argument("--zoo", type=Path, default=Path("../shared/zoo"))
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     failed = [given.name for given in options.given if run_arms(given, options.out, options.threads) != 0]
-    print(tables(options.out, options.zoo))
+    print(tables(options.out, options.zoo, options.objects))
     for name in failed:
         print(f"error: p2gs bench failed on {name}", file=sys.stderr)
     return 1 if failed else 0
