@@ -3,7 +3,8 @@ the joint.
 
 Scenes are one object at several openings, named NAME_<degrees>. A run succeeds where every joint is found with its
 type, and axis and motion are within a degree. The basin of a setting is the largest opening that two of three of its
-seeds solve; what a single seed solves beyond it is told beside. Writes basin.md, basin.csv and, with matplotlib, basin.png into BENCH_DIR/tables.
+seeds solve; what a single seed solves beyond it is told beside. Writes basin.md, basin.csv and, with matplotlib,
+basin.png into BENCH_DIR/tables.
 """
 
 from __future__ import annotations
