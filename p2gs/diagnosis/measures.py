@@ -255,7 +255,7 @@ def fusion(canonical: CanonicalGaussians, time: float) -> dict:
 
 def articulation(states, motions, canonical, learned, views, unit: float, render: dict) -> dict:
     """Image loss of the twin in both states' photographs as fusion handed it over and as it was learned; how far joints
-    went."""
+    went (None for a spare slot, which discovery knows nothing of)."""
     out = {"image_loss_start": None, "image_loss_end": None, "joints": []}
     labels = learned.part_ids
     after = [
@@ -269,10 +269,12 @@ def articulation(states, motions, canonical, learned, views, unit: float, render
     before = [carry(canonical.gaussians, canonical.labels, se3.screw_at(T, s - times)) for s in (0, 1)]
     out["image_loss_start"] = own_loss(before, views, render)
     for k, kind in enumerate(learned.types):
-        shift, turn = apart(
-            motions.transforms[k], learned.transforms[k], states[0].gaussians.means[motions.labels[0] == k + 1]
-        )
-        out["joints"].append({"slot": k + 1, "type": kind, "moved_degrees": turn, "moved": shift * unit})
+        row: dict[str, Any] = {"slot": k + 1, "type": kind, "moved_degrees": None, "moved": None}
+        if k < len(motions):
+            own = states[0].gaussians.means[motions.labels[0] == k + 1]
+            shift, turn = apart(motions.transforms[k], learned.transforms[k], own)
+            row |= {"moved_degrees": turn, "moved": shift * unit}
+        out["joints"].append(row)
     return out
 
 

@@ -1,6 +1,7 @@
 """Every ablation takes two steps of fusion and articulation, on the default and the literal preset, and runs what it is
 named for."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -144,6 +145,22 @@ def test_spare_slots_have_an_equal_share_and_parts_too_many_are_merged(scene, tm
     torch.testing.assert_close(share, torch.full((3,), 1 / 6), atol=0.02, rtol=0)
     _, phase, _ = run_two_steps("cpu", "k_2", scene, tmp_path / "under")
     assert len(phase.types) == 1
+
+
+@pytest.mark.parametrize("name, slots", [("k_6", 6), ("k_2", 2)])
+def test_a_wrong_number_of_slots_comes_to_a_twin_that_tells_of_each(name, slots, scene, tmp_path):
+    words = ["--phases.finish.exports", "[]", "--phases.finish.polish.steps", "1", "--phases.finish.tune.steps", "1"]
+    pipe, phase, learned = run_two_steps("cpu", name, scene, tmp_path, *words)
+    states, motions = states_and_motions()
+    motions, _ = merge_to(motions, states, slots)
+    given = {"states": states, "motions": motions}
+    given["canonical"] = pipe.make("canonical_fusion", given)
+    pipe.make("finish", {**given, "learned": learned})
+    told = json.loads((tmp_path / "slots.json").read_text())
+    assert [s["slot"] for s in told] == list(range(slots)) and sum(s["share"] for s in told) == pytest.approx(1)
+    assert [s["slot"] for s in told if s["spare"]] == list(range(len(motions) + 1, slots))
+    joints = json.loads((tmp_path / "diagnostics.json").read_text())["articulation"]["joints"]
+    assert [j["moved"] is None for j in joints] == [s["spare"] for s in told[1:]]
 
 
 def test_the_parts_that_are_merged_are_those_of_the_cheapest_joint():

@@ -47,6 +47,14 @@ def test_two_of_three_seeds_solve_an_opening(bench):
     assert len((folder / "tables" / "basin.csv").read_text().splitlines()) == 1 + len(found)
 
 
+def test_one_seed_makes_no_basin_and_is_told_beside_it(bench):
+    good, bad = (0.2, 0.9), (0.2, 1.1)
+    runs = {("ours", 20): [good, good, bad], ("ours", 45): [good], ("lucky", 20): [good], ("lucky", 45): [bad]}
+    text = markdown(outcomes(bench(runs)))
+    assert "| ours | 2 of 3 | 1 of 1 | 20 deg (45 by one seed) |" in text
+    assert "| lucky | 1 of 1 | 0 of 1 | none (20 by one seed) |" in text
+
+
 def test_mistakes_are_told(bench, tmp_path, capsys):
     with pytest.raises(UserError, match="no cells.json"):
         outcomes(tmp_path)

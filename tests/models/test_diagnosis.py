@@ -189,6 +189,23 @@ def test_without_discovery_and_without_parts(tmp_path):
     assert any("slot 1 of 1 vanished" in v["text"] for v in d["verdict"])
 
 
+def test_a_spare_slot_that_became_a_part(tmp_path):
+    stages, _, views = small_run()
+    states, labels, _ = two_states(hinge())
+    learned, labels, moving = stages.learned, labels.clone(), (labels == 1).nonzero()[:, 0]
+    labels[moving[: len(moving) // 2]] = 2
+    probs = torch.nn.functional.one_hot(labels, 3).float()
+    both = torch.cat([learned.transforms, learned.transforms])
+    learned = Articulation(learned.gaussians, probs, ["revolute", "free"], both, torch.ones(2), 0.0)
+    config = FinishConfig(polish=PolishConfig(steps=0), clean_neighbours=0, islands=0.0)
+    twin, notes, record = finish(learned, states, views, config, Similarity(), seed=0, backend="auto")
+    stages = replace(stages, learned=learned, record=record, notes=notes)
+    d = write_diagnosis(tmp_path, stages, twin, views, min_margin=0.1)
+    found, spare = d["articulation"]["joints"]
+    assert found["moved"] == 0 and spare == {"slot": 2, "type": "free", "moved_degrees": None, "moved": None}
+    assert record.slots == [1, 2] and [row["slot"] for row in d["joints"]] == [1, 2]
+
+
 def test_fog_is_counted():
     states, _, views = two_states(hinge())
     g = states[0].gaussians
