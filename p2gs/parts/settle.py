@@ -36,8 +36,8 @@ def reconsider(
     take each for the other at the end (``places_changed``), and for each part the two amounts about one axis that
     explain most (``in_two``). Under each proposal every surfel chooses its part anew, and with the ``candidates`` of
     each kind that surfaces like best the states are re-rendered. The best of each kind is refined, and the energy must
-    fall; with a further part by its price (``judge.further``), and the image loss must fall by that share as well: what
-    surfaces alone gain, or photographs against them, is junk. Returns the motions and what was tried.
+    fall; with a further part the image loss must as well (``judge.further``): what surfaces alone gain is junk. Returns
+    the motions and what was tried.
     """
     found, states, log = judge.found, judge.states, []
     lowest, cost = judge(motions)
@@ -56,8 +56,7 @@ def reconsider(
             value, reached, refined = judge.improved(tried)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
             log[-1] |= {"proposed": judge(tried)[0] - lowest, "energy": value - lowest}
-            more = len(refined) > len(motions)
-            junk = more and (reached > cost * (1 - judge.further) or value > lowest - judge.further)
+            junk = len(refined) > len(motions) and reached > cost * (1 - judge.further)
             if value < (lowest if best is None else best[0]) and not junk:
                 best = (value, reached, refined)
         if best is None:
