@@ -267,21 +267,16 @@ def test_relabel_by_the_true_motion_labels_like_the_search():
     assert not label.any()
 
 
-def test_moved_surface_counts_alike_whichever_state_shows_it(stacked):
-    """Shut, a drawer shows next to nothing that moved, open all of its tray: the few must not outweigh the many."""
+def test_a_state_that_shows_nothing_moved_is_looked_at_where_its_fate_is_unknown(stacked):
     problem = stacked[0]
-    few = torch.zeros_like(problem.moved[0])
-    few[problem.moved[0].nonzero()[:5, 0]] = True
-    drawn = resampled(replace(problem, moved=[few, problem.moved[1]]), 0, by_surface=True)
-    assert len(drawn.samples[0]) == 5 and sum(float(w.sum()) for w in drawn.weights) == pytest.approx(2)
-    trust = [float(t[m].mean()) for t, m in zip(problem.trust, (few, problem.moved[1]), strict=True)]
-    expected = 5 * trust[0] / (int(problem.moved[1].sum()) * trust[1])
-    assert float(drawn.weights[0].sum() / drawn.weights[1].sum()) == pytest.approx(expected, rel=0.1)
-    alike = resampled(replace(problem, moved=[few, problem.moved[1]]), 0)
-    assert [float(w.sum()) for w in alike.weights] == pytest.approx([1, 1])
-    # a state that shows nothing is looked at where its fate is unknown
-    none = resampled(replace(problem, moved=[torch.zeros_like(few), problem.moved[1]]), 0)
-    assert len(none.samples[0]) and not problem.static[0][none.samples[0]].any()
+    assert [float(w.sum()) for w in resampled(problem, 0).weights] == pytest.approx([1, 1])
+    none = torch.zeros_like(problem.moved[0])
+    drawn = resampled(replace(problem, moved=[none, problem.moved[1]]), 0)
+    assert len(drawn.samples[0]) and not problem.static[0][drawn.samples[0]].any()
+    # each surfel counts alike then: the few of unknown fate do not outweigh the many that moved
+    mass = [int((~problem.static[0]).sum()), int(problem.moved[1].sum())]
+    mass = [m * float(t[i].mean()) for m, t, i in zip(mass, problem.trust, drawn.samples, strict=True)]
+    assert [float(w.sum()) for w in drawn.weights] == pytest.approx([2 * m / sum(mass) for m in mass])
 
 
 def test_what_arrives_on_surface_of_unknown_fate_need_not_be_answered():
@@ -289,5 +284,6 @@ def test_what_arrives_on_surface_of_unknown_fate_need_not_be_answered():
     motions = Motions(torch.zeros(3, dtype=torch.bool), torch.eye(3), torch.zeros(3, 3), torch.ones(3))
     evidence = torch.tensor([[0, 0, 254, 254], [0, 0, 255, 255], [254, 254, 254, 254]], dtype=torch.uint8)
     half = torch.full((2,), 0.5)
-    gain = Sweep(motions, evidence, [torch.arange(2)] * 2).gain([half, half])
-    assert gain.tolist() == pytest.approx([0.03, 1.0, 2 * 254 / 255])
+    for one_sided, unknown in ((True, 1.0), (False, 0.03)):
+        gain = Sweep(motions, evidence, [torch.arange(2)] * 2, one_sided).gain([half, half])
+        assert gain.tolist() == pytest.approx([0.03, unknown, 2 * 254 / 255])

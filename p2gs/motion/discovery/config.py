@@ -24,8 +24,7 @@ class DiscoveryConfig:
     thickest: greatest thickness of a plate of which the states may show different sides, times the box diagonal.
     min_mass: least share of the moved surface of a part.  min_moved: fewest moved surfels a state below which nothing
     moved.
-    searches: how often the set is searched, each time among other samples; every second time each moved surfel counts
-    alike, whichever state shows it, else both states do.  candidates: best sets of each that are
+    searches: how often the set is searched, each time among other samples.  candidates: best sets of each that are
     looked into.
     """
 

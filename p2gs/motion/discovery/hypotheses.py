@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from p2gs.motion.discovery.fields import Landing, normal_code
-from p2gs.motion.discovery.problem import Problem
+from p2gs.motion.discovery.problem import Problem, one_sided
 from p2gs.motion.discovery.rigid import Motions, perpendicular
 
 PLATE = 0.5  # thickness of plates in the sweep, coarse voxels: surfaces within three quarters of one count as met
@@ -113,25 +113,24 @@ def arrival_table(landing: Landing, moved: Tensor, share: float = 1.0) -> Tensor
 @dataclass
 class Sweep:
     """Every motion tried and its evidence [H, P0 + P1] (uint8, as in ``arrival_table``) over a sample of the moved
-    points of both states."""
+    points of both states.  one_sided: one of the states shows next to nothing that moved."""
 
     motions: Motions
     evidence: Tensor
     samples: list[Tensor]
+    one_sided: bool = False
 
     def gain(self, weights: list[Tensor], chunk: int = 20000) -> Tensor:
         """Evidence of each motion, points weighted [P0], [P1] (both states' weights sum to at most 2); states must
-        agree, but for what arrives on surfaces of unknown fate."""
+        agree, but for what arrives on surfaces of unknown fate where one state shows next to nothing that moved."""
         n = len(weights[0])
         w = torch.zeros(n + len(weights[1]), 2)
         w[:n, 0], w[n:, 1] = weights[0] / 255, weights[1] / 255
-        known, loose = [], []
-        for i in range(0, len(self.evidence), chunk):
-            rows = self.evidence[i : i + chunk]
-            known.append((rows * (1 - rows % 2)).float() @ w)
-            loose.append((rows * (rows % 2)).float() @ w)
-        (a, b), (c, d) = torch.cat(known).T, torch.cat(loose).T
-        return torch.minimum(a, 3 * (b + d) + 0.03) + torch.minimum(b, 3 * (a + c) + 0.03) + c + d
+        rows = self.evidence.split(chunk)
+        a, b = torch.cat([r.float() @ w for r in rows]).T
+        free = torch.cat([(r * (r % 2)).float() @ w for r in rows]).T if self.one_sided else torch.zeros(2, len(a))
+        known = torch.minimum(a - free[0], 3 * b + 0.03) + torch.minimum(b - free[1], 3 * a + 0.03)
+        return known + free.sum(0)
 
 
 def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120000) -> Sweep:
@@ -206,7 +205,7 @@ def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120
         score = evidence.float().sum(1)
         index = score.topk(keep).indices.sort().values
         motions, evidence = motions[index], evidence[index]
-    return Sweep(motions, evidence, samples)
+    return Sweep(motions, evidence, samples, one_sided(problem))
 
 
 def distinct(motions: Motions, score: Tensor, probe: Tensor, radius: float, count: int) -> Tensor:

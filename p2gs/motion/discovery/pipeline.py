@@ -69,7 +69,7 @@ def discover(
         searches = max(config.searches, 1)
         figures |= {"axes": axes.tolist(), "search": []}
         for number in range(searches):
-            looked = problem if number == 0 else resampled(problem, seed + number, by_surface=number % 2 == 1)
+            looked = problem if number == 0 else resampled(problem, seed + number)
             swept = sweep(
                 looked, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in looked.samples]
             )

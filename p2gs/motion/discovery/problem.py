@@ -191,24 +191,29 @@ def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryCon
     return problem, figures
 
 
-def resampled(problem: Problem, seed: int, by_surface: bool = False) -> Problem:
-    """The problem with moved surfels drawn anew to look at (``samples``) and their weights: both states count alike, or
-    ``by_surface`` each moved surfel does, whichever state shows it.
+def one_sided(problem: Problem) -> bool:
+    """Does one of the states show next to nothing that moved?"""
+    return min(int(m.sum()) for m in problem.moved) < FEWEST
 
-    A state that shows next to nothing that moved (of a shut drawer the front alone, before which the open drawer stands
-    in the other state) is looked at where its fate is unknown.
+
+def resampled(problem: Problem, seed: int) -> Problem:
+    """The problem with moved surfels drawn anew to look at (``samples``) and their weights: both states count alike.
+
+    Where one state shows next to nothing that moved (of a shut drawer the front alone, before which the open drawer
+    stands in the other state), it is looked at where its fate is unknown, and each surfel counts alike.
     """
     g = torch.Generator().manual_seed(seed)
-    samples, weights = [], []
+    by_surface, samples, weights = one_sided(problem), [], []
     for s in (0, 1):
         index = torch.nonzero(problem.moved[s])[:, 0]
         if len(index) < FEWEST:
             index = torch.nonzero(~problem.static[s])[:, 0]
         samples.append(index[spread_sample(problem.surfels[s].points[index], problem.config.samples, g)])
         weight = problem.trust[s][samples[s]]
-        total = float(weight.sum())
-        weights.append(weight * (len(index) / max(len(weight), 1) if by_surface else 1 / max(total, 1e-9)))
-    total = sum(float(w.sum()) for w in weights)
+        weights.append(
+            weight * len(index) / max(len(weight), 1) if by_surface else weight / weight.sum().clamp_min(1e-9)
+        )
+    total = sum(float(w.sum()) for w in weights) if by_surface else 2.0
     return replace(problem, samples=samples, weights=[2 * w / max(total, 1e-9) for w in weights])
 
 

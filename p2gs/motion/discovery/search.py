@@ -76,9 +76,8 @@ class Search:
         slide.
         """
         left = [(1 - a).clamp(0, 1) for a in self.pool.explained(chosen)]
-        total = sum(float(w[r].sum()) for w, r in zip(self.problem.weights, self.sweep_rows, strict=True))
         weights = [
-            2 * (x * w)[r] / max(total, 1e-9)
+            w.sum() * (x * w)[r] / w[r].sum().clamp_min(1e-9)
             for x, w, r in zip(left, self.problem.weights, self.sweep_rows, strict=True)
         ]
         g = self.swept.gain(weights)
