@@ -19,6 +19,7 @@ from p2gs.motion.discovery import Discovery, StateEvidence, discover, relabel
 from p2gs.motion.refine_motions import Judge, leave_false_minima
 from p2gs.parts.askew import lay_axes
 from p2gs.parts.bodies import Surfaces, one_part_a_body
+from p2gs.parts.expand import expand
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import join_twins, settle_types, simplify
 from p2gs.parts.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
@@ -49,6 +50,7 @@ def find_part_motions(
     judge = Judge(found, states, views, config.coarse, found.problem.stacks, further=config.part_penalty, **options)
     explanations, looks = _looked_at(judge, _explanations(found), config, say)
     motions, compared = _compared(judge, explanations, config, say)
+    motions, expanded = expand(judge, motions)
     limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
     motions, improved = _improved(judge, motions, limit, config, say)
     say("settling labels and motions")
@@ -69,6 +71,7 @@ def find_part_motions(
         "evidence": [found.evidence_start.to(torch.int8), found.evidence_end.to(torch.int8)],
         "min_opacity": config.min_opacity,
         **compared,
+        "expanded": expanded,
         **improved,
         "rounds": rounds,
         "joined": joined,
