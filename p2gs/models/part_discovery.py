@@ -55,7 +55,7 @@ def find_part_motions(
     motions, improved = _improved(judge, motions, limit, config, say)
     say("settling labels and motions")
     motions, rounds = settle_labels(judge, motions, config)
-    motions, joined = join_twins(states, motions, found.problem.scale.tp)
+    motions, joined = join_twins(states, motions, found.problem.scale.apart)
     if joined:
         motions = judge.refine(motions)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)

@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.ops import se3
+from p2gs.ops.components import components
 from p2gs.visibility.depth_stack import DepthStack, classify
 
 # points nearer than this, in spacings, lie on one surface: two, and the spacing is the median of an uneven sample
@@ -37,15 +36,6 @@ class Surfaces:
     spacing: float
     stacks: list[DepthStack]
     tau: float
-
-
-def pieces(points: Tensor, reach: float) -> np.ndarray:
-    """Connected component [N] of points [N, 3], joined where they are nearer than ``reach``."""
-    pairs = cKDTree(points.numpy()).query_pairs(reach, output_type="ndarray")
-    n = len(points)
-    return connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (n, n)), directed=False)[
-        1
-    ]
 
 
 def seen_empty(points: Tensor, motion: Tensor, stacks: list[DepthStack], tau: float) -> Tensor:
@@ -84,7 +74,7 @@ def bodies_of(surfaces: Surfaces, part: int, motion: Tensor) -> list[list[Tensor
         return [rows]
     places = [surfaces.points[s][rows[s]].double() for s in (0, 1)]
     points = torch.cat([places[0], se3.apply(se3.inverse(motion), places[1])])
-    piece, split = pieces(points, TOUCH * surfaces.spacing), len(rows[0])
+    piece, split = components(points, TOUCH * surfaces.spacing), len(rows[0])
     sizes = [(int((piece[:split] == c).sum()), int((piece[split:] == c).sum())) for c in range(piece.max() + 1)]
     large = sorted((c for c, n in enumerate(sizes) if min(n) >= FEWEST), key=lambda c: -sum(sizes[c]))
     if len(large) < 2:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.discovery import as_motions, axes_used
 from p2gs.motion.refine_motions import Judge
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
@@ -15,8 +16,8 @@ from p2gs.ops.knn import knn
 
 def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None) -> PartMotions:
     """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the
-    energy does not rise; drop a part, too, that saves less of the image loss than a further one must
-    (``judge.further``).
+    energy does not rise; drop a part, too, that has an axis of its own and saves less of the image loss than a further
+    one must (``judge.further``).
 
     log: told of each part that goes: what was done, its type, image loss with and without it, what the energy gains.
     """
@@ -28,7 +29,7 @@ def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[d
                 continue
             tried.add(change)
             value, lower = judge(reduced)
-            if value <= lowest or (change[0] == "drop" and cost > lower * (1 - judge.further)):
+            if value <= lowest or (lonely(motions, reduced) and cost > lower * (1 - judge.further)):
                 break
         else:
             return motions
@@ -38,6 +39,12 @@ def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[d
         motions, lowest, cost = reduced, value, lower
         tried.clear()
     return motions
+
+
+def lonely(more: PartMotions, fewer: PartMotions) -> bool:
+    """Is there an axis less without what ``more`` has beside ``fewer``? Of a row of drawers each saves little, and has
+    the axis of the others."""
+    return axes_used(as_motions(more.transforms, more.types)) > axes_used(as_motions(fewer.transforms, fewer.types))
 
 
 def join_twins(states, motions: PartMotions, reach: float) -> tuple[PartMotions, list[dict]]:

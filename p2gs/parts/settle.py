@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.motion.discovery import Candidate, Discovery, in_two, instead_of, places_changed, relabel
+from p2gs.motion.directions import directions_of
+from p2gs.motion.discovery import Candidate, Discovery, in_rows, in_two, instead_of, places_changed, relabel
 from p2gs.motion.refine_motions import Judge
 from p2gs.ops.sh import dc_to_rgb
 from p2gs.parts.islands import settle_islands
 from p2gs.parts.options import PartMotionsConfig
-from p2gs.parts.part_choices import settle_types, without_part
+from p2gs.parts.part_choices import lonely, settle_types, without_part
 
 
 def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
@@ -30,11 +31,11 @@ def reconsider(
     judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig
 ) -> tuple[PartMotions, list[dict]]:
     """Exchange motions for others that explain what the refined rest leaves over, those of two like parts for such as
-    change their ends, add one, or make one part two, while the energy falls.
+    change their ends, add one, make one part two, or many of a row of drawers, while the energy falls.
 
     For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such as
-    take each for the other at the end (``places_changed``), and for each part the two amounts about one axis that
-    explain most (``in_two``). Under each proposal every surfel chooses its part anew, and with the ``candidates`` of
+    take each for the other at the end (``places_changed``), for each part the two amounts about one axis that explain
+    most (``in_two``), and the amounts of all bodies that slid one way (``in_rows``). Under each proposal every surfel chooses its part anew, and with the ``candidates`` of
     each kind that surfaces like best the states are re-rendered. The best of each kind is refined, and the energy must
     fall; with a further part the image loss must as well (``judge.further``): what surfaces alone gain is junk. Returns
     the motions and what was tried.
@@ -47,6 +48,8 @@ def reconsider(
         if len(motions) < limit:
             tries["added"] = [(len(motions), m) for m in _with_part(found, states, motions, None)]
             tries["parted"] = _proposed(found, states, motions, in_two(found, motions.transforms, motions.types))
+            in_row = in_rows(found, motions.transforms, motions.types, directions_of(states, motions.labels), limit)
+            tries["in a row"] = _proposed(found, states, motions, [(0, *row) for row in in_row])
         best = None
         for change, proposed in tries.items():
             if not proposed:
@@ -56,7 +59,7 @@ def reconsider(
             value, reached, refined = judge.improved(tried)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
             log[-1] |= {"proposed": judge(tried)[0] - lowest, "energy": value - lowest}
-            junk = len(refined) > len(motions) and reached > cost * (1 - judge.further)
+            junk = lonely(refined, motions) and reached > cost * (1 - judge.further)
             if value < (lowest if best is None else best[0]) and not junk:
                 best = (value, reached, refined)
         if best is None:

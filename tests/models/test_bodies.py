@@ -6,7 +6,8 @@ import torch
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.ops import se3
-from p2gs.parts.bodies import FEWEST, Surfaces, bodies_of, one_part_a_body, pieces
+from p2gs.ops.components import components
+from p2gs.parts.bodies import FEWEST, Surfaces, bodies_of, one_part_a_body
 from p2gs.types import GaussianTensors
 
 
@@ -48,7 +49,7 @@ TWO = torch.cat([plate(0.0), plate(0.4)])  # 0.22 of nothing between them
 
 
 def test_pieces_are_what_touches():
-    assert pieces(TWO.double(), 0.05).max() == 1 and pieces(TWO.double(), 0.25).max() == 0
+    assert components(TWO.double(), 0.05).max() == 1 and components(TWO.double(), 0.25).max() == 0
 
 
 def test_plates_that_a_look_goes_between_are_two_bodies():

@@ -2,8 +2,18 @@
 selection, labels."""
 
 from p2gs.motion.discovery.config import DiscoveryConfig
-from p2gs.motion.discovery.pipeline import discover, in_two, instead_of, places_changed, relabel, surface_energy
+from p2gs.motion.discovery.pipeline import (
+    as_motions,
+    discover,
+    in_rows,
+    in_two,
+    instead_of,
+    places_changed,
+    relabel,
+    surface_energy,
+)
 from p2gs.motion.discovery.result import Candidate, Discovery, FoundMotion
+from p2gs.motion.discovery.rigid import axes_used
 from p2gs.visibility.depth_stack import StateEvidence
 
 __all__ = [
@@ -12,7 +22,10 @@ __all__ = [
     "DiscoveryConfig",
     "FoundMotion",
     "StateEvidence",
+    "as_motions",
+    "axes_used",
     "discover",
+    "in_rows",
     "in_two",
     "instead_of",
     "places_changed",

@@ -17,7 +17,6 @@ from p2gs.motion.discovery.labels import Graph, Labelling, unary
 from p2gs.motion.discovery.problem import Problem
 from p2gs.motion.discovery.rigid import Motions, without
 
-STEP = 1 / 3  # between amounts that are tried, tolerances across surfaces: a third of what tells two places apart
 STEPS = 200  # at most
 
 
@@ -31,12 +30,12 @@ def arm_of(problem: Problem, labelling: Labelling, motion: Motions, k: int) -> f
 
 
 def amounts_of(problem: Problem, motion: Motions, arm: float) -> Motions:
-    """``motion`` [1] by every amount of its sign that the search considers, a third of a tolerance apart at ``arm``
+    """``motion`` [1] by every amount of its sign that the search considers, as far apart as surfaces tell at ``arm``
     from the axis: [D]."""
-    cfg, tp = problem.config, problem.scale.tp
+    cfg, scale = problem.config, problem.scale
     most = math.radians(cfg.max_angle) if bool(motion.turn) else cfg.max_slide * problem.scale.diag
-    least = tp / arm
-    n = min(max(int((most - least) / (STEP * tp / arm)), 2), STEPS)
+    least = scale.tp / arm
+    n = min(max(int((most - least) / (scale.apart / arm)), 2), STEPS)
     amount = torch.linspace(least, most, n) * torch.sign(motion.amount)
     return Motions(
         motion.turn.expand(n), motion.axis.expand(n, 3), motion.centre.expand(n, 3), amount, motion.thick.expand(n)

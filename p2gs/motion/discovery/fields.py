@@ -45,6 +45,11 @@ class Scale:
     spacing: float
     diag: float
 
+    @property
+    def apart(self) -> float:
+        """How far apart two motions must carry a body for its surfaces, many points together, to tell them apart."""
+        return self.tp / 3
+
 
 class Landing:
     """Cost in 0..1 of a surfel arriving somewhere in one state.

@@ -20,7 +20,8 @@ from p2gs.motion.discovery.pairs import crossed
 from p2gs.motion.discovery.pool import plausibility
 from p2gs.motion.discovery.problem import FEWEST, Problem, build_problem, resampled
 from p2gs.motion.discovery.result import Candidate, Discovery, FoundMotion
-from p2gs.motion.discovery.rigid import Motions, without
+from p2gs.motion.discovery.rigid import Motions, axes_used, without
+from p2gs.motion.discovery.rows import rows
 from p2gs.motion.discovery.search import ExclusiveGain, Search, two_sided
 from p2gs.motion.discovery.verify import image_score, violation
 from p2gs.ops import se3
@@ -182,6 +183,24 @@ def in_two(found: Discovery, transforms: Tensor, types: list[str]) -> list[tuple
     return out
 
 
+def in_rows(
+    found: Discovery, transforms: Tensor, types: list[str], axes: Tensor, limit: int
+) -> list[tuple[Tensor, list[str]]]:
+    """Up to ``limit`` motions where several bodies slid along one of the directions ``axes`` [D, 3], each by an amount
+    of its own (``rows``): (motions [K', 4, 4], their types)."""
+    if found.search is None:
+        return []
+    own = sided(found.problem, as_motions(transforms, types))
+    labelling = label(found.problem, own, found.graphs)
+    return [stacked(m) for m in rows(found.problem, labelling, own, axes.float()) if len(m) <= limit]
+
+
+def stacked(motions: Motions) -> tuple[Tensor, list[str]]:
+    """Motions as transforms [K, 4, 4] and types "revolute" | "prismatic"."""
+    kinds = ["revolute" if bool(t) else "prismatic" for t in motions.turn]
+    return torch.stack([motions.transform(i) for i in range(len(motions))]), kinds
+
+
 def places_changed(
     found: Discovery, transforms: Tensor, types: list[str], count: int = 3
 ) -> list[tuple[int, Tensor, list[str]]]:
@@ -192,8 +211,7 @@ def places_changed(
     own = sided(found.problem, as_motions(transforms, types))
     out = []
     for k, more in crossed(found.search, label(found.problem, own, found.graphs), own, count):
-        kinds = ["revolute" if bool(t) else "prismatic" for t in more.turn]
-        out.append((k, torch.stack([more.transform(i) for i in range(len(more))]), kinds))
+        out.append((k, *stacked(more)))
     return out
 
 
@@ -290,8 +308,11 @@ def prune(
 
 
 def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> float:
-    """Image-space violation, the price of every part and half of the moved surface that hangs on implausible joints.
-    Lower is better."""
+    """Image-space violation, the price of the parts and half of the moved surface that hangs on implausible joints.
+    Lower is better.
+
+    A further slide along a direction that another one has costs a third: of its three freedoms it takes one.
+    """
     if not len(motions):
         return image_score(problem, motions, labelling)
     pays = [p for p, _ in problem.pay(motions)]
@@ -301,7 +322,9 @@ def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> flo
             * (1 - plausibility(problem, motions, pays, problem.samples, False))
         ).sum()
     )
-    return image_score(problem, motions, labelling) + problem.config.part_cost * len(motions) + 0.5 * doubt
+    axes = axes_used(motions)
+    price = problem.config.part_cost * (axes + (len(motions) - axes) / 3)
+    return image_score(problem, motions, labelling) + price + 0.5 * doubt
 
 
 def twins(problem: Problem, motions: Motions, labelling: Labelling) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -24,6 +25,9 @@ def perpendicular(axis: Tensor) -> tuple[Tensor, Tensor]:
     helper = torch.zeros_like(axis).scatter_(-1, axis.abs().argmin(-1, keepdim=True), 1.0)
     e1 = torch.nn.functional.normalize(torch.linalg.cross(helper, axis), dim=-1)
     return e1, torch.linalg.cross(axis, e1)
+
+
+ONE_WAY = math.cos(math.radians(2.0))  # slides nearer than that to parallel: noise of a direction found for one body
 
 
 @dataclass
@@ -205,3 +209,12 @@ class Motions:
 def without(motions: Motions, k: int) -> Motions:
     """All motions but ``k``."""
     return motions[torch.tensor([i for i in range(len(motions)) if i != k], dtype=torch.long)]
+
+
+def axes_used(motions: Motions) -> int:
+    """How many axes the motions have: one for each turn, one for each direction that slides share (``ONE_WAY``)."""
+    ways: list[Tensor] = []
+    for way in motions.axis[~motions.turn]:
+        if not any(float((way @ other).abs()) > ONE_WAY for other in ways):
+            ways.append(way)
+    return int(motions.turn.sum()) + len(ways)
