@@ -38,7 +38,7 @@ def kept_and_shown(
     Carried to the other state by its part's motion a Gaussian is shown there where most views see it on a surface of
     the same part, of like colour and from the side that its own state shows. It is contradicted where they see through
     it or its ends (it reaches over the edge of what it was labelled with), and where it lies on a surface that is not
-    like it. Inside and behind, where nobody looks, nothing is.
+    like it. Inside and behind, where nobody looks, nothing is, nor on a thin plate's other side, which hides it.
     stacks: rendered depth of both states.
     """
     g, labels = states[state].gaussians, motions.labels[state]
@@ -50,11 +50,13 @@ def kept_and_shown(
     on[moving], through[moving] = met(stack, at[moving], config.free_moving)
     for end in ends(g[moving]):
         through[moving] |= met(stack, landed(end, labels[moving], T), config.free_static)[1]
-    like = alike(states, motions, state, at, config.other_colour)
+    like, part = alike(states, motions, state, at, config.other_colour)
     own = (way[:, :3, :3] @ stacks[state].seen_from(g.means[moving], config.free_static)[..., None])[..., 0]
     same_side = (own * stack.seen_from(at[moving], config.free_moving)).sum(1) > 0
-    like[moving] &= same_side | ~on[moving]
-    return ~through & (like | ~on), ~through & like & on
+    behind = torch.zeros_like(on)
+    behind[moving] = part[moving] & ~same_side
+    like &= ~behind | ~on
+    return ~through & (like | ~on | behind), ~through & like & on
 
 
 def met(stack: DepthStack, points: Tensor, tau: float) -> tuple[Tensor, Tensor]:
@@ -84,17 +86,21 @@ def ends(g: GaussianTensors) -> list[Tensor]:
     return [g.means + sign * axes[..., a] for a in (0, 1) for sign in (1, -1)]
 
 
-def alike(states: list[StateGaussians], motions: PartMotions, state: int, at: Tensor, other_colour: float) -> Tensor:
-    """[N] bool: is one of the other state's solid Gaussians next to ``at`` [N, 3] of the same part and of like colour
-    (0..1, mean of channels)?"""
+def alike(
+    states: list[StateGaussians], motions: PartMotions, state: int, at: Tensor, other_colour: float
+) -> tuple[Tensor, Tensor]:
+    """[N] bool each: is one of the other state's solid Gaussians next to ``at`` [N, 3] of the same part and of like
+    colour (0..1, mean of channels), and of the same part at all?"""
     g, other = states[state].gaussians, states[1 - state].gaussians
     solid = (torch.sigmoid(other.opacity_logits) > SOLID).nonzero().squeeze(1)
     if len(solid) < NEIGHBOURS:
-        return torch.zeros(len(at), dtype=torch.bool)
+        none = torch.zeros(len(at), dtype=torch.bool)
+        return none, none
     near = solid[knn(other.means[solid].contiguous(), at.contiguous(), NEIGHBOURS)[1]]
     colours, theirs = dc_to_rgb(g.sh[:, 0]).clamp(0, 1), dc_to_rgb(other.sh[:, 0]).clamp(0, 1)
     apart = (theirs[near] - colours[:, None]).abs().mean(-1)
-    return ((motions.labels[1 - state][near] == motions.labels[state][:, None]) & (apart < other_colour)).any(1)
+    same = motions.labels[1 - state][near] == motions.labels[state][:, None]
+    return (same & (apart < other_colour)).any(1), same.any(1)
 
 
 class ShownPixels:
