@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from p2gs.gaussians.handover import StateGaussians
+from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.agreement import SOLID
 from p2gs.motion.discovery.hypotheses import shared_directions
 from p2gs.motion.discovery.rigid import perpendicular
@@ -18,13 +18,14 @@ FEWEST = 20  # points of a plane
 ROUNDS = 3  # of planes found and fitted
 
 
-def directions_of(states: list[StateGaussians], labels: list[Tensor]) -> Tensor:
-    """[D, 3] directions (float64) of the static Gaussians of both states: ``shared_directions`` of their normals, each
-    fitted to the planes that face it (``common_normal``). labels [N] of each state (0 static)."""
+def directions_of(states: list[StateGaussians], motions: PartMotions) -> Tensor:
+    """[D, 3] directions (float64) of what turned in neither state: ``shared_directions`` of the normals of static and
+    slid Gaussians, each fitted to the planes that face it (``common_normal``)."""
+    turned = torch.tensor([False, *(kind == "revolute" for kind in motions.types)])
     points, normals = [], []
-    for state, of in zip(states, labels, strict=True):
+    for state, of in zip(states, motions.labels, strict=True):
         g = state.gaussians.detach()
-        still = (of == 0).cpu() & (torch.sigmoid(g.opacity_logits).cpu() > SOLID)
+        still = ~turned[of.cpu()] & (torch.sigmoid(g.opacity_logits).cpu() > SOLID)
         R = so3.quat_to_matrix(so3.quat_normalize(g.quats.cpu()[still]))
         shortest = g.log_scales.cpu()[still].argmin(1)
         normals.append(R.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0])

@@ -28,7 +28,7 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
     log: list[dict] = []
     if price <= 0 or judge.config.steps <= 0:
         return motions, log
-    directions = directions_of(judge.states, motions.labels) if len(motions) else torch.zeros(0, 3)
+    directions = directions_of(judge.states, motions) if len(motions) else torch.zeros(0, 3)
     held = torch.full((len(motions), 3), math.nan, dtype=torch.float64)
     for k, kind in enumerate(motions.types):
         lowest = judge(motions)[0]

@@ -33,12 +33,12 @@ def reconsider(
     """Exchange motions for others that explain what the refined rest leaves over, those of two like parts for such as
     change their ends, add one, make one part two, or many of a row of drawers, while the energy falls.
 
-    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such as
-    take each for the other at the end (``places_changed``), for each part the two amounts about one axis that explain
-    most (``in_two``), and the amounts of all bodies that slid one way (``in_rows``). Under each proposal every surfel chooses its part anew, and with the ``candidates`` of
-    each kind that surfaces like best the states are re-rendered. The best of each kind is refined, and the energy must
-    fall; with a further part the image loss must as well (``judge.further``): what surfaces alone gain is junk. Returns
-    the motions and what was tried.
+    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such
+    as take each for the other at the end (``places_changed``), for each part the two amounts about one axis that
+    explain most (``in_two``), and the amounts of all bodies that slid one way (``in_rows``). Under each proposal
+    every surfel chooses its part anew, and with the ``candidates`` of each kind that surfaces like best the states
+    are re-rendered. The best of each kind is refined, and the energy must fall; with a further part the image loss
+    must as well (``judge.further``): what surfaces alone gain is junk. Returns the motions and what was tried.
     """
     found, states, log = judge.found, judge.states, []
     lowest, cost = judge(motions)
@@ -48,7 +48,7 @@ def reconsider(
         if len(motions) < limit:
             tries["added"] = [(len(motions), m) for m in _with_part(found, states, motions, None)]
             tries["parted"] = _proposed(found, states, motions, in_two(found, motions.transforms, motions.types))
-            in_row = in_rows(found, motions.transforms, motions.types, directions_of(states, motions.labels), limit)
+            in_row = in_rows(found, motions.transforms, motions.types, directions_of(states, motions), limit)
             tries["in a row"] = _proposed(found, states, motions, [(0, *row) for row in in_row])
         best = None
         for change, proposed in tries.items():

@@ -46,12 +46,16 @@ def cube(state: int) -> StateGaussians:
 
 def test_directions_of_a_cube_are_its_axes_to_a_tenth_of_a_degree():
     labels = [torch.zeros(2400, dtype=torch.long)] * 2
-    found = directions_of([cube(0), cube(1)], labels)
+    nothing = PartMotions([], torch.zeros(0, 4, 4).double(), torch.zeros(0), labels, [])
+    found = directions_of([cube(0), cube(1)], nothing)
     assert len(found) == 3
     assert {int(d.abs().argmax()) for d in found} == {0, 1, 2}
     assert max(degrees_between(d, torch.eye(3).double()[int(d.abs().argmax())]) for d in found) < 0.1
-    # what moves has no say
-    assert not len(directions_of([cube(0), cube(1)], [torch.ones_like(x) for x in labels]))
+    # what slides faces the same way in both states, what turns does not and has no say
+    for kind, count in (("prismatic", 3), ("revolute", 0)):
+        all_of_it = nothing.with_motion(0, kind, torch.eye(4).double())
+        all_of_it.labels = [torch.ones_like(x) for x in labels]
+        assert len(directions_of([cube(0), cube(1)], all_of_it)) == count
 
 
 def test_common_normal_is_that_of_several_planes_at_once():
