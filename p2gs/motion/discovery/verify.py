@@ -24,7 +24,8 @@ def violation(
     """Cost [M] in 0..1 of the labelled surfels ``index`` [M] of ``state``: the share of the other state's views that
     see through where a point is predicted, of those not blocked by something in front; where they see a surface that is
     of another part or another colour, as wrong as empty space (of a plate's other side, ``motions.thick`` away, colours
-    tell nothing); ``Landing.HIDDEN`` where all are blocked. A moved point that is called static is wrong."""
+    tell nothing); where all are blocked ``Landing.HIDDEN``, or by the plate's other side ``Landing.TWO_SIDED``. A moved
+    point that is called static is wrong."""
     surf, stack, other = problem.surfels[state], problem.stacks[1 - state], problem.surfels[1 - state]
     labels = labelling.labels(state)[index]
     x, n, thick = surf.points[index].clone(), surf.normals[index].clone(), torch.zeros(len(index))
@@ -35,14 +36,16 @@ def violation(
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(views))
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
     d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
-    like = (labelling.labels(1 - state)[j] == labels[:, None]) & (
+    own = (labelling.labels(1 - state)[j] == labels[:, None]) & (
         d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None]
     )
-    other_side = ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
-    like &= other_side | ((other.colours[j] - surf.colours[index][:, None]).abs().mean(2) < problem.config.recoloured)
+    other_side = own & ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
+    coloured = (other.colours[j] - surf.colours[index][:, None]).abs().mean(2) < problem.config.recoloured
+    like = other_side | (own & coloured)
     through = free / (free + on).clamp_min(1)
     shown = through + (1 - through) * torch.where(like.any(1), 0.0, WRONG)
-    cost = torch.where(free + on > 0, shown, torch.full_like(free, Landing.HIDDEN))
+    hidden = torch.where(other_side.any(1), Landing.TWO_SIDED, Landing.HIDDEN)
+    cost = torch.where(free + on > 0, shown, hidden.to(free))
     return torch.where((labels == 0) & problem.moved[state][index], torch.full_like(cost, WRONG), cost)
 
 
