@@ -9,17 +9,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from boxes import both, door, drawer, shell
+from boxes import PLAIN, both, door, drawer, shell
 
+from p2gs.data.generated.articulated import SyntheticPart, revolute
+from p2gs.data.generated.furniture import box
 from p2gs.motion.discovery.amounts import parted
 from p2gs.motion.discovery.config import DiscoveryConfig
+from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.discovery.finish import Explanation
 from p2gs.motion.discovery.hypotheses import Sweep
 from p2gs.motion.discovery.labels import REVEALED, Graph, Labelling, label, unary
 from p2gs.motion.discovery.pipeline import as_motions, discover, ranked, relabel, static_axes, total_score
 from p2gs.motion.discovery.problem import build_problem, evidence_masks, resampled
 from p2gs.motion.discovery.refine import pattern_search
-from p2gs.motion.discovery.rigid import Motions
+from p2gs.motion.discovery.rigid import Motions, axes_used
+from p2gs.motion.discovery.rows import rows
 from p2gs.motion.discovery.search import Search
 from p2gs.motion.discovery.verify import violation
 from p2gs.visibility.depth_stack import DepthStack, classify
@@ -158,6 +162,49 @@ def test_where_a_part_lands_on_another_it_is_as_wrong_as_in_empty_space(stacked)
     lost = Labelling([torch.eye(3)[torch.zeros(len(p), dtype=torch.long)] for p in right.probability], right.cost)
     moved = problem.moved[1].nonzero()[:, 0]
     assert bool((violation(problem, truth, lost, 1, moved) == 1).all())  # what moved is called static
+
+
+def test_what_its_own_plates_other_side_hides_costs_less_than_what_anything_hides():
+    plate = (box((0, -0.6, -0.6), (0.12, 0.6, 0.6), PLAIN),)
+    obj = shell(SyntheticPart("door", plate, revolute((0, 0, -1.0), (0.12, -0.6, 0), 0, 110)))
+    (start, end), _ = both(obj)
+    problem, _ = build_problem(start, end, DiscoveryConfig(surfels=4000), 0)
+    T = torch.from_numpy(obj.parts[1].pose(1.0) @ np.linalg.inv(obj.parts[1].pose(0.0)))[None]
+    thin, graphs = as_motions(T, ["revolute"]), [Graph(s.points, s.normals, s.colours) for s in problem.surfels]
+    corners = np.concatenate([q.corners for q in obj.parts[1].primitives])
+    thick = float((corners.max(0) - corners.min(0)).min())
+    plate = replace(thin, thick=torch.tensor([thick]))
+    labelling = label(problem, plate, graphs)
+    back = (thin.axis[0].new_tensor([-1.0, 0.0, 0.0]) @ thin.rotate(problem.surfels[1].normals, True)[0].T) > 0.9
+    index = (back & (labelling.labels(1) == 1)).nonzero()[:, 0]  # the inside: shut, the front hides it
+    assert len(index) > 50
+    costs = [violation(problem, m, labelling, 1, index).median() for m in (thin, plate)]
+    assert float(costs[0]) == pytest.approx(Landing.HIDDEN) and float(costs[1]) == pytest.approx(Landing.TWO_SIDED)
+
+
+def test_each_drawer_of_a_row_has_the_amount_that_its_own_front_went():
+    travels = (0.30, 0.33, 0.37)
+    row = [drawer(y, y + 0.36, -0.3, 0.3, t) for y, t in zip((-0.58, -0.18, 0.22), travels, strict=True)]
+    obj = shell(*row)
+    (start, end), _ = both(obj, points=8000)
+    problem, _ = build_problem(start, end, DiscoveryConfig(surfels=8000), 0)
+    T = torch.stack([torch.from_numpy(part.pose(1.0) @ np.linalg.inv(part.pose(0.0))) for part in obj.parts[1:]])
+    truth = as_motions(T, ["prismatic"] * 3)
+    one = truth[1:2]
+    graphs = [Graph(s.points, s.normals, s.colours) for s in problem.surfels]
+    (found,) = rows(problem, label(problem, one, graphs), one, truth.axis[:1])
+    assert axes_used(found) == 1
+    for amount in truth.amount:
+        assert float((found.amount - amount).abs().min()) < problem.scale.apart
+    assert not rows(problem, label(problem, one, graphs), one, torch.tensor([[0.0, 0.0, 1.0]]))  # none slid upwards
+
+
+def test_slides_along_one_direction_share_an_axis_and_turns_do_not():
+    z = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3).clone()
+    z[3] = torch.tensor([0.0, 0.0, -1.0])
+    turn = torch.tensor([True, True, False, False])
+    motions = Motions(turn, z, torch.zeros(4, 3), torch.ones(4))
+    assert axes_used(motions) == 3 and axes_used(motions[2:]) == 1 and axes_used(Motions.empty()) == 0
 
 
 def test_classify_needs_enough_views_and_a_majority():

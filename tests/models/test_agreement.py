@@ -51,14 +51,23 @@ def test_what_arrives_on_its_own_surface_is_shown():
     assert kept.all() and shown.all()
 
 
-@pytest.mark.parametrize("why", ["another part's", "another colour", "other side", "seen through"])
+@pytest.mark.parametrize("why", ["another part's", "another colour", "seen through"])
 def test_what_arrives_on_another_surface_or_in_the_air_has_no_say(why):
     one = torch.ones(169, dtype=torch.long)
     end_labels = torch.zeros_like(one) if why == "another part's" else one
     there = splats(grid(0.5), colour=1.5 if why == "another colour" else 0.0)
-    stack = facing(0.5, side=-1.0) if why == "other side" else facing(0.3 if why == "seen through" else 0.5)
+    stack = facing(0.3 if why == "seen through" else 0.5)
     kept, shown = asked(splats(grid(0.0)), one, there, end_labels, stack)
     assert not kept.any() and not shown.any()
+
+
+@pytest.mark.parametrize("colour", [0.0, 1.5])
+def test_a_thin_plates_other_side_hides_and_contradicts_nothing(colour):
+    one, there = torch.ones(169, dtype=torch.long), splats(grid(0.5), colour=colour)
+    kept, shown = asked(splats(grid(0.0)), one, there, one, facing(0.5, side=-1.0))
+    assert kept.all() and not shown.any()
+    kept, _ = asked(splats(grid(0.0)), one, there, torch.zeros_like(one), facing(0.5, side=-1.0))
+    assert not kept.any()  # it is another part's side
 
 
 def test_what_arrives_out_of_sight_is_kept_but_not_shown():

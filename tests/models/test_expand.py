@@ -1,0 +1,37 @@
+"""A part may take the static surface or the whole object where the energy falls."""
+
+import torch
+
+from p2gs.gaussians.handover import PartMotions
+from p2gs.parts.expand import expand, expansions
+
+
+def two_parts() -> PartMotions:
+    labels = [torch.tensor([0, 0, 1, 1, 2]), torch.tensor([0, 1, 1, 2, 2])]
+    T = torch.eye(4).double().repeat(2, 1, 1)
+    T[:, 0, 3] = torch.tensor([0.1, 0.2]).double()
+    return PartMotions(["prismatic", "prismatic"], T, torch.tensor([0.9, 0.5]), labels, [torch.ones(5)] * 2)
+
+
+def test_expansions_are_each_parts_with_the_static_surface_and_with_everything():
+    found = {(how, k): m for how, k, m in expansions(two_parts())}
+    assert len(found) == 4
+    assert found["took the static surface", 1].labels[0].tolist() == [2, 2, 1, 1, 2]
+    whole = found["took the whole object", 1]
+    assert (
+        len(whole) == 1
+        and bool((whole.transforms[0] == two_parts().transforms[1]).all())
+        and float(whole.confidence[0]) == 0.5
+    )
+    assert all(bool((own == 1).all()) for own in whole.labels)
+
+
+def test_the_expansion_of_lowest_energy_is_taken_and_none_that_is_higher():
+    def nothing_stands_still(m: PartMotions):
+        return float(sum((own == 0).sum() for own in m.labels)) + len(m), 1.0
+
+    motions, log = expand(nothing_stands_still, two_parts())
+    assert len(motions) == 1 and log == [{"change": "took the whole object", "part": 0, "energy": -4.0}]
+    start = two_parts()
+    motions, log = expand(lambda m: (-float(sum((own == 0).sum() for own in m.labels)), 1.0), start)
+    assert motions is start and log == []
