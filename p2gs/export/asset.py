@@ -67,10 +67,10 @@ class Placement:
 
 @dataclass(frozen=True)
 class Asset:
-    """links[0] is the static base, ``Link.bare`` where nothing of the object stands still.  blocking: (moving link, other link) that run into each other in one of the other's
-    recorded states, as a door before a drawer does.  lost: share of a link's collision volume that was trimmed to give
-    joints room, by name.  fixed: whether the base stands fast in the world or may fall over; None: as each format has
-    it.  material: one of ``DENSITIES``."""
+    """links[0] is the static base (``Link.bare`` where nothing stands still). blocking: (moving link, other link) that
+    run into each other in one of the other's recorded states, as a door before a drawer does. lost: share of a link's
+    collision volume that was trimmed to give joints room, by name. fixed: whether the base stands fast in the world or
+    may fall over; None: as each format has it. material: one of ``DENSITIES``."""
 
     name: str
     links: list[Link]
