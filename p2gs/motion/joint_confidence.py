@@ -150,8 +150,8 @@ class CrossViews:
     Photographs: ``looks`` of them at size ``level``, spread over ``views``; each part is measured on the ``count`` that
     show most of it.
 
-    static_error: mean |render - photo| where the static part shows, nan where it shows nowhere.  bright_static: share of
-    the object's pixels where the static part shows and is off by more than ``BRIGHT``.
+    static_error: mean |render - photo| where the static part shows, nan where it shows nowhere.  bright_static: share
+    of the object's pixels where the static part shows and is off by more than ``BRIGHT``.
     """
 
     def __init__(
