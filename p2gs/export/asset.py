@@ -67,10 +67,10 @@ class Placement:
 
 @dataclass(frozen=True)
 class Asset:
-    """links[0] is the static base.  blocking: (moving link, other link) that run into each other in one of the other's
-    recorded states, as a door before a drawer does.  lost: share of a link's collision volume that was trimmed to give
-    joints room, by name.  fixed: whether the base stands fast in the world or may fall over; None: as each format has
-    it.  material: one of ``DENSITIES``."""
+    """links[0] is the static base (``Link.bare`` where nothing stands still). blocking: (moving link, other link) that
+    run into each other in one of the other's recorded states, as a door before a drawer does. lost: share of a link's
+    collision volume that was trimmed to give joints room, by name. fixed: whether the base stands fast in the world or
+    may fall over; None: as each format has it. material: one of ``DENSITIES``."""
 
     name: str
     links: list[Link]
@@ -101,9 +101,11 @@ def load_asset(
 
     scale: metres per input unit.  up: axis of the target that points up; the input's is z.  origin: ``keep`` the
     input's, ``center`` of the object's box, or the middle of its ``bottom``.  solid: with collision pieces and inertia;
-    without, for looking at only, it takes no time.  extend_range: joint limits beyond the observed motion, until pieces
+    without, for looking at only, it takes no time.  A moving part without a surface is left out, a base without one is
+    bare.  extend_range: joint limits beyond the observed motion, until pieces
     touch (only where solid).  texture: makes one of a part's id and mesh (``texture.Baker``).  splats: with each part's
-    Gaussians.  Raises UserError for other values or a run without a twin.
+    Gaussians.  Raises UserError for other values, a run without a twin or
+    one of which no part has a surface.
     """
     if up not in UPS:
         raise UserError(f"--up is '{up}', expected one of {', '.join(UPS)}")
@@ -117,11 +119,14 @@ def load_asset(
     if meshes is None:
         write_meshes(run_dir)
         meshes = read_meshes(run_dir)
-    place = placement(np.concatenate([m.vertices for m in meshes]), scale, up, origin)
-    pairs = [(p, m) for p, m in zip(obj.parts, meshes, strict=True) if len(m.faces)]
-    if not pairs or pairs[0][0].joint is not None:
-        raise UserError(f"{run_dir}: the static part has no surface, so there is no base to hang joints on")
-    links = [make_link(part.id, part.joint, mesh, place, density, max_faces, solid, texture) for part, mesh in pairs]
+    place = placement(shown_points(run_dir, meshes), scale, up, origin)
+    links = [
+        make_link(part.id, part.joint, mesh, place, density, max_faces, solid, texture)
+        if len(mesh.faces)
+        else bare_base(part.id)
+        for part, mesh in zip(obj.parts, meshes, strict=True)
+        if len(mesh.faces) or part.joint is None
+    ]
     if splats:
         start = pose(obj, 0.0)
         links = [replace(x, splats=place.gaussians(start[obj.part_ids == x.part], x.origin)) for x in links]
@@ -141,8 +146,15 @@ def start_box(run_dir: Path | str) -> np.ndarray:
     if meshes is None:
         write_meshes(run_dir)
         meshes = read_meshes(run_dir)
-    points = np.concatenate([m.vertices for m in meshes])
+    points = shown_points(run_dir, meshes)
     return np.array([points.min(0), points.max(0)])
+
+
+def shown_points(run_dir: Path | str, meshes: list[Mesh]) -> np.ndarray:
+    """Vertices [V, 3] of all parts. Raises UserError where there is no surface at all."""
+    if not any(len(m.faces) for m in meshes):
+        raise UserError(f"{run_dir}: no part of the twin has a surface, so there is nothing to export")
+    return np.concatenate([m.vertices for m in meshes])
 
 
 def placement(points: np.ndarray, scale: float, up: str, origin: str) -> Placement:
@@ -196,6 +208,12 @@ def make_link(
     return Link(
         name, part, visual, pieces, inertia, hinge, colour, texture(part, world) if texture else None, closed=closed
     )
+
+
+def bare_base(part: int) -> Link:
+    """The base of an object of which nothing stands still: no surface, no collision pieces, no mass."""
+    nothing = Inertia(0.0, np.zeros(3), np.zeros((3, 3)))
+    return Link("base", part, Mesh.empty(), [], nothing, None, (0.0, 0.0, 0.0))
 
 
 def open_note(asset: Asset) -> Optional[str]:

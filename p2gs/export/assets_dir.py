@@ -23,7 +23,7 @@ def write_assets(asset: Asset, out: Path) -> None:
     for old in folder.glob("*.obj"):
         for suffix in (".obj", ".mtl", ".png"):
             old.with_suffix(suffix).unlink(missing_ok=True)
-    for link in asset.links:
+    for link in (one for one in asset.links if not one.bare):
         write_obj(
             folder / visual_name(link), link.visual.vertices, link.visual.faces, link.visual.colours, link.texture
         )

@@ -8,6 +8,7 @@ from typing import Callable, Iterable, Mapping, Optional
 
 from p2gs.export.asset import DENSITIES, Asset, load_asset, open_note
 from p2gs.export.assets_dir import write_obj
+from p2gs.export.links import Link
 from p2gs.export.metadata import read_meta
 from p2gs.export.naming import with_names
 from p2gs.export.profiles import PROFILE_UP, PROFILES, Context
@@ -71,6 +72,15 @@ def spz(asset: Asset, out: Path) -> Path:
     return write_spz(asset, out)
 
 
+def shown_links(asset: Asset, folder: Path) -> list[Link]:
+    """Those with a surface; a bare base's file of an earlier export goes."""
+    for link in asset.links:
+        if link.bare:
+            for old in folder.glob(f"{link.name}.*"):
+                old.unlink()
+    return [link for link in asset.links if not link.bare]
+
+
 @EXPORTERS.register("ply")
 def ply(asset: Asset, out: Path) -> Path:
     """parts/<link>.ply at the start state, vertex colours."""
@@ -79,7 +89,7 @@ def ply(asset: Asset, out: Path) -> Path:
 
     folder = out / "parts"
     folder.mkdir(parents=True, exist_ok=True)
-    for link in asset.links:
+    for link in shown_links(asset, folder):
         v = link.visual
         write_mesh(folder / f"{link.name}.ply", Mesh(v.vertices + link.origin, v.faces, v.colours))
     return folder
@@ -90,7 +100,7 @@ def obj(asset: Asset, out: Path) -> Path:
     """parts/<link>.obj at the start state, vertex colours, perhaps a texture."""
     folder = out / "parts"
     folder.mkdir(parents=True, exist_ok=True)
-    for link in asset.links:
+    for link in shown_links(asset, folder):
         v = link.visual
         write_obj(folder / f"{link.name}.obj", v.vertices + link.origin, v.faces, v.colours, link.texture)
     return folder
@@ -105,7 +115,8 @@ class ExportOptions:
     material: one of ``DENSITIES``, which the masses go by.
     names: links are called by what they are, which geometry tells but for those given here by part
     (``naming.with_names``).
-    fixed: whether the base stands fast in the world (URDF: on a link ``world``); None: as the format has it.
+    fixed: whether the base stands fast in the world (URDF: on a link ``world``); None: as the format has it. A bare one
+    always does.
     splats: USD also has each part's Gaussians.
     """
 
@@ -127,7 +138,13 @@ class ExportOptions:
         """The run's asset under these options, as far as the formats need it."""
         made = {"solid": solid, "splats": splats, "extend_range": self.extend_range, "texture": baker}
         asset = load_asset(run_dir, self.scale, up, self.origin, DENSITIES[self.material], **made)
-        asset = replace(asset, fixed=self.fixed, material=self.material)
+        if asset.links[0].bare and self.fixed is False:
+            raise UserError(
+                f"--floating: {run_dir} has no base that could fall over: none of what stands still has a surface, so "
+                "its joints hang on the world"
+            )
+        # a base without mass is the world, which readers take from a link of that name alone
+        asset = replace(asset, fixed=asset.links[0].bare or self.fixed, material=self.material)
         return asset if self.names is None else with_names(asset, self.names)
 
 

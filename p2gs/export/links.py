@@ -56,7 +56,7 @@ class Hinge:
 @dataclass(frozen=True)
 class Link:
     """A rigid part at the start state. Geometry is in the link's frame: world axes, origin at the joint's (base: the
-    world's)."""
+    world's). A base of which nothing was seen is ``bare``: the place in the world that joints hang on."""
 
     name: str
     part: int
@@ -69,6 +69,11 @@ class Link:
     label: str = ""  # what it is, of ``naming``: door, drawer; empty where names are those of the twin
     closed: bool = True  # whether the surface encloses a volume
     splats: Optional[GaussianTensors] = None  # the part's Gaussians, in the link's frame like the rest
+
+    @property
+    def bare(self) -> bool:
+        """Whether it shows no surface; it has no collision pieces and no mass then."""
+        return not len(self.visual.faces)
 
     @property
     def hinge(self) -> Hinge:

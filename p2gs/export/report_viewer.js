@@ -45,6 +45,7 @@
   }
   const lo = [Infinity, Infinity, Infinity], hi = [-Infinity, -Infinity, -Infinity];
   const parts = doc.nodes.slice(1).map((node) => {
+    if (node.mesh === undefined) return { node, vao: null, count: 0, share: 0 }; // a base of which nothing is seen
     const primitive = doc.meshes[node.mesh].primitives[0], vao = gl.createVertexArray();
     gl.bindVertexArray(vao);
     const layout = [["position", "POSITION", 3, gl.FLOAT, false], ["normal", "NORMAL", 3, gl.FLOAT, false], ["tint", "COLOR_0", 4, gl.UNSIGNED_BYTE, true]];

@@ -39,7 +39,8 @@ class JointEvidence:
     coverage: share of the part's Gaussians that land on a surface of the other state (the better of the two directions:
     a shut drawer hides its inside).  contradicted: share that lands where the other state's cameras see through (the
     worse direction).
-    residual: mean |render - photo| over the part's pixels, as a multiple of the static part's there.
+    residual: mean |render - photo| over the part's pixels, as a multiple of the static part's there (nan where nothing
+    static shows).
     rise: relative growth of that residual when the part is displaced by ``STEP``, mean of both signs, in the direction
     that matters least: the curvature of the photometric cost.  fall: how much it falls in the best of those directions:
     0 at a minimum.
@@ -149,8 +150,8 @@ class CrossViews:
     Photographs: ``looks`` of them at size ``level``, spread over ``views``; each part is measured on the ``count`` that
     show most of it.
 
-    static_error: mean |render - photo| where the static part shows.  bright_static: share of the object's pixels where
-    the static part shows and is off by more than ``BRIGHT``.
+    static_error: mean |render - photo| where the static part shows, nan where it shows nowhere.  bright_static: share
+    of the object's pixels where the static part shows and is off by more than ``BRIGHT``.
     """
 
     def __init__(
@@ -190,7 +191,8 @@ class CrossViews:
         self.windows = [[self.window(i, near[i][k + 1]) for i in rows] for k, rows in enumerate(self.chosen)]
         still = [(s[..., 0] > 0.5) & ~n[1:].any(0) for s, n in zip(self.shares, near, strict=True)]
         total = sum(int(m.sum()) for m in still)
-        self.static_error = sum(float(e[m].sum()) for e, m in zip(self.errors, still, strict=True)) / max(total, 1)
+        wrong = sum(float(e[m].sum()) for e, m in zip(self.errors, still, strict=True))
+        self.static_error = wrong / total if total else float("nan")
         bright = sum(int((e[m] > BRIGHT).sum()) for e, m in zip(self.errors, still, strict=True))
         self.bright_static = bright / max(sum(int((shot.alpha > 0.5).sum()) for shot in self.shots), 1)
 
@@ -259,7 +261,7 @@ def measure_joints(
     for k, kind in enumerate(types):
         here = [c for c in crossed if c.windows[k]]
         base = sum(c.part_error(k, c.transforms[k]) for c in here) / max(len(here), 1)
-        static = sum(c.static_error for c in here) / max(len(here), 1)
+        told = [c.static_error for c in here if not math.isnan(c.static_error)]
         rises, falls = [], [0.0]
         if here:
             changed = [changes(c, k, kind) for c in here]
@@ -271,7 +273,7 @@ def measure_joints(
             JointEvidence(
                 coverage=max(way[k][0] for way in landed),
                 contradicted=max(way[k][1] for way in landed),
-                residual=base / max(static, 1e-3) if here else float("nan"),
+                residual=base / max(sum(told) / len(told), 1e-3) if told else float("nan"),
                 rise=min(rises, default=0.0),
                 fall=max(falls),
                 disagreement=parted(states[0], labels[0], k, *both) if both is not None else None,

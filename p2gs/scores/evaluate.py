@@ -153,7 +153,7 @@ def surface_scores(
     run_dir: Path, truth: "GroundTruth", assignment: dict[int, int], missing: list[str]
 ) -> Optional[dict]:
     """Chamfer distances of RUN/meshes against the ground truth's; None where either is missing."""
-    from p2gs.metrics.chamfer import PartMeshes, read_part_meshes
+    from p2gs.metrics.chamfer import PartMeshes, is_empty, read_part_meshes
 
     pred, gt = {}, {}
     for state, name in enumerate(STATES):
@@ -171,6 +171,10 @@ def surface_scores(
         gt[name] = read_part_meshes(true.whole, true.static, true.dynamic)
     chamfer = PartChamfer()
     chamfer.update(pred, gt, assignment)
+    if chamfer.report.static is None:
+        bare = all(m.static is None or is_empty(m.static) for m in gt.values())
+        whose = "ground truth's" if bare else "twin's"
+        missing.append(f"the {whose} static part has no surface, so there is no Chamfer distance of it")
     return chamfer.report.to_dict()
 
 

@@ -1,6 +1,7 @@
 """A joint's confidence falls with its error, with lost support and with two directions that disagree; it needs no
 ground truth."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -52,6 +53,14 @@ def turned(T, degrees, tilt=False):
 @pytest.fixture(scope="module")
 def door():
     return world(hinge())
+
+
+def test_without_a_static_part_there_is_nothing_that_a_part_looks_worse_than(door):
+    """All is the door's, so that it is right where the door was and wrong elsewhere."""
+    states, labels, views = door
+    with_static = evidence(states, labels, views, hinge(), "revolute")
+    alone = evidence(states, torch.ones_like(labels), views, hinge(), "revolute")
+    assert math.isfinite(with_static.residual) and math.isnan(alone.residual) and math.isfinite(alone.confidence)
 
 
 @pytest.mark.parametrize("tilt", [False, True])

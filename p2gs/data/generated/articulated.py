@@ -65,7 +65,8 @@ class SyntheticPart:
 
 @dataclass(frozen=True)
 class SyntheticObject:
-    """parts[0] is static, the others move. ``fitted`` brings it to the size of the benchmarks' objects."""
+    """parts[0] is static (without primitives where all moves), the others move. ``fitted`` brings it to the size of the
+    benchmarks' objects."""
 
     name: str
     parts: tuple[SyntheticPart, ...]
@@ -117,7 +118,8 @@ class SyntheticObject:
 
 
 def concatenate(meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Several (vertices [V, 3], faces [F, 3]) as one."""
+    """Several (vertices [V, 3], faces [F, 3]) as one; without vertices where there are none."""
+    meshes = [(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), *meshes]
     offsets = np.cumsum([0] + [len(v) for v, _ in meshes[:-1]])
     return np.concatenate([v for v, _ in meshes]), np.concatenate(
         [f + o for (_, f), o in zip(meshes, offsets, strict=True)]

@@ -65,7 +65,8 @@ def write_glb(asset: Asset, out: Path) -> Path:
 def glb_bytes(asset: Asset) -> bytes:
     """The file's content."""
     buffer = Buffer()
-    meshes = [_mesh(buffer, link) for link in asset.links]
+    shown = [link for link in asset.links if not link.bare]
+    meshes = [_mesh(buffer, link) for link in shown]
     textured = [(link.name, link.texture) for link in asset.links if link.texture is not None]
     document: dict = {}
     if textured:  # read between texels, but from no smaller copies, in which neighbours run together
@@ -79,7 +80,7 @@ def glb_bytes(asset: Asset) -> bytes:
     for mesh in meshes:
         mesh["primitives"][0]["material"] = number.get(mesh["name"], len(textured))
     document["materials"] = [_material(name, i) for i, (name, _) in enumerate(textured)]
-    if len(textured) < len(asset.links):
+    if len(textured) < len(shown):
         document["materials"].append(_material("scan"))
     return animated_glb(asset, buffer, meshes, document)
 

@@ -29,7 +29,7 @@ def write_mjcf(asset: Asset, out: Path) -> Path:
     meshes = ET.SubElement(root, "asset")
     world = ET.SubElement(root, "worldbody")
     ET.SubElement(world, "light", pos="0 0 3", directional="true")
-    for link in asset.links:
+    for link in (one for one in asset.links if not one.bare):
         # an open shell has no volume; its mass is not used, but the compiler would stumble over it
         ET.SubElement(meshes, "mesh", name=link.name, file=visual_name(link), inertia="shell")
         if link.texture is not None:
@@ -65,6 +65,8 @@ def _defaults(root: ET.Element) -> None:
 
 def _body(parent: ET.Element, link: Link) -> ET.Element:
     body = ET.SubElement(parent, "body", name=link.name, pos=numbers(link.origin))
+    if link.bare:
+        return body
     m = link.inertia.matrix
     full = (m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
     ET.SubElement(

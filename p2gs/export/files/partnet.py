@@ -76,6 +76,8 @@ def write_partnet(asset: Asset, out: Path, meta: Mapping[str, object]) -> list[P
 
 def _link(robot: ET.Element, link: Link, i: int, out: Path) -> None:
     element = ET.SubElement(robot, "link", name=f"link_{i}")
+    if link.bare:
+        return
     add_inertial(element, link)
     visual = ET.SubElement(element, "visual", name=f"{link.label}-{i + 1}")
     shown = f"{OBJS}/original-{i + 1}.obj"
@@ -94,13 +96,13 @@ def _mesh(parent: ET.Element, name: str) -> None:
 
 
 def _leaf(link: Link, i: int) -> dict:
-    return {"id": i + 1, "name": link.label, "text": link.label, "objs": [f"original-{i + 1}"]}
+    return {"id": i + 1, "name": link.label, "text": link.label, "objs": [] if link.bare else [f"original-{i + 1}"]}
 
 
 def _entry(link: Link, i: int, root: int, kinds: Mapping[Optional[str], str]) -> dict:
     """A link of mobility_v2.json: origins in the object's frame, limits in degrees or its unit of length, 0 = start."""
     hinge = link.joint
-    parts = [{"id": i + 1, "name": link.label, "children": []}]
+    parts = [] if link.bare else [{"id": i + 1, "name": link.label, "children": []}]
     entry = {"id": i, "parent": root, "joint": kinds[hinge and hinge.type], "name": link.label, "parts": parts}
     if hinge is None:
         return entry | {"parent": -1, "jointData": {}}

@@ -52,6 +52,8 @@ def write_xml(robot: ET.Element, path: Path) -> Path:
 
 def _link(robot: ET.Element, link: Link) -> None:
     element = ET.SubElement(robot, "link", name=link.name)
+    if link.bare:
+        return
     add_inertial(element, link)
     visual = ET.SubElement(element, "visual")
     _mesh(visual, visual_name(link))

@@ -14,11 +14,15 @@ from p2gs.export.asset import Asset
 from p2gs.export.assets_dir import texture_name
 from p2gs.export.files.splats_usd import splat_prim
 from p2gs.export.links import Hinge, Link
+from p2gs.export.physics.inertia import Inertia
 from p2gs.surface.tsdf import vertex_normals
 from p2gs.types import UserError
 
 TEXTURES = "textures"  # folder beside the stage
 FRICTION = 0.6  # of surfaces on each other, as in MJCF: wood on wood
+# kg and kg m^2 of a base that shows nothing: articulations want a rigid body for their root, one without a mass draws a
+# warning and gets these, and as it stands fast they act on nothing
+BARE = Inertia(1.0, np.zeros(3), np.eye(3))
 Value = Union[str, int, float, Sequence[float], Mapping[str, "Value"]]  # of layer metadata
 
 
@@ -102,17 +106,27 @@ def _contact(label: str) -> list[str]:
 
 
 def _link(link: Link) -> list[str]:
-    values, rotation = principal(link.inertia.matrix)
+    inertia = BARE if link.bare else link.inertia
+    values, rotation = principal(inertia.matrix)
     body = [
         f'    def Xform "{link.name}" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"])',
         "    {",
         f"        double3 xformOp:translate = {_tuple(link.origin)}",
         '        uniform token[] xformOpOrder = ["xformOp:translate"]',
-        f"        float physics:mass = {link.inertia.mass!r}",
-        f"        point3f physics:centerOfMass = {_tuple(link.inertia.center)}",
+        f"        float physics:mass = {inertia.mass!r}",
+        f"        point3f physics:centerOfMass = {_tuple(inertia.center)}",
         f"        float3 physics:diagonalInertia = {_tuple(values)}",
         f"        quatf physics:principalAxes = {_tuple(rotation)}",
     ]
+    if not link.bare:
+        body += _shapes(link)
+    if link.splats is not None and len(link.splats):
+        body += splat_prim(link.splats, "        ")
+    return [*body, "    }"]
+
+
+def _shapes(link: Link) -> list[str]:
+    """What a link shows, and its collision pieces."""
     visual = link.visual
     look = [
         f"color3f[] primvars:displayColor = {_array(visual.colours / 255, 4)} (",
@@ -130,15 +144,13 @@ def _link(link: Link) -> list[str]:
     if link.label:
         schemas.append("SemanticsLabelsAPI:class")
         look.append(f'token[] semantics:labels:class = ["{link.label}"]')
-    body += _mesh("visual", visual.vertices, visual.faces, look, schemas)
+    body = _mesh("visual", visual.vertices, visual.faces, look, schemas)
     for i, piece in enumerate(link.collision):
         extra = ['uniform token physics:approximation = "convexHull"', 'uniform token purpose = "guide"']
         extra.append("rel material:binding:physics = </twin/contact>")
         schemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI", "MaterialBindingAPI"]
         body += _mesh(f"collision_{i}", piece.vertices, piece.faces, extra, schemas)
-    if link.splats is not None and len(link.splats):
-        body += splat_prim(link.splats, "        ")
-    return [*body, "    }"]
+    return body
 
 
 def _texture(out: Path, link: Link) -> Path:

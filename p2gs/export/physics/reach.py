@@ -20,7 +20,7 @@ def extend_links(links: list[Link]) -> list[Link]:
     """The links (cleared of one another, ``links[0]`` the base) with joint limits that go on until pieces touch.
 
     Each end of a joint's range is followed among the other parts as they were in that photographed state; half of the
-    gap that clearing left stays. What was observed stays within the limits.
+    gap that clearing left stays. What was observed stays within the limits, and is all that a slide without a base has.
     """
     bodies = [body_of(link) for link in links]
     points = np.concatenate([p.vertices for b in bodies for p in b.pieces])
@@ -51,6 +51,8 @@ def follow(
 
     others: with their poses [4, 4].
     """
+    if a.hinge.type == "prismatic" and not base.pieces:  # nothing that would hold it
+        return start
     farthest = _farthest(a, base, direction)
     step = (FULL_TURN if a.hinge.type == "revolute" else float(np.ptp(_along(base, a.hinge.axis)))) / STEPS
     at, halved = start, 0
