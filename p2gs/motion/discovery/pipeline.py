@@ -311,7 +311,7 @@ def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> flo
     """Image-space violation, the price of the parts and half of the moved surface that hangs on implausible joints.
     Lower is better.
 
-    A further slide along a direction that another one has costs a third: of its three freedoms it takes one.
+    A further slide along the very direction of another costs a third: of its three freedoms it takes one.
     """
     if not len(motions):
         return image_score(problem, motions, labelling)
