@@ -192,11 +192,23 @@ def test_each_drawer_of_a_row_has_the_amount_that_its_own_front_went():
     truth = as_motions(T, ["prismatic"] * 3)
     one = truth[1:2]
     graphs = [Graph(s.points, s.normals, s.colours) for s in problem.surfels]
-    (found,) = rows(problem, label(problem, one, graphs), one, truth.axis[:1])
+    found, *single = rows(problem, label(problem, one, graphs), one, truth.axis[:1])
     assert axes_used(found) == 1
     for amount in truth.amount:
         assert float((found.amount - amount).abs().min()) < problem.scale.apart
-    assert not rows(problem, label(problem, one, graphs), one, torch.tensor([[0.0, 0.0, 1.0]]))  # none slid upwards
+    assert single and all(len(m) == 1 for m in single)
+
+
+def test_a_tray_that_seems_turned_is_offered_the_slide_that_its_front_asks_for():
+    obj = shell(drawer(-0.5, 0.5, -0.3, 0.3, 0.4))
+    (start, end), _ = both(obj, points=6000)
+    problem, _ = build_problem(start, end, DiscoveryConfig(surfels=6000), 0)
+    T = torch.from_numpy(obj.parts[1].pose(1.0) @ np.linalg.inv(obj.parts[1].pose(0.0)))[None]
+    truth = as_motions(T, ["prismatic"])
+    turned = Motions(torch.tensor([True]), torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3), torch.tensor([1.57]))
+    graphs = [Graph(s.points, s.normals, s.colours) for s in problem.surfels]
+    found = Motions.cat(rows(problem, label(problem, turned, graphs), turned, truth.axis))
+    assert not bool(found.turn.any()) and float((found.amount - truth.amount).abs().min()) < problem.scale.apart
 
 
 def test_slides_along_one_direction_share_an_axis_and_turns_do_not():

@@ -22,13 +22,17 @@ TOUCH = 2.5  # spacings between neighbours on one surface, as in parts/bodies.py
 
 def rows(problem: Problem, labelling: Labelling, motions: Motions, axes: Tensor) -> list[Motions]:
     """For each direction of ``axes`` [D, 3] along which several bodies slid: their motions instead of the slides along
-    it."""
+    it. And for each part, instead of its motion, each slide along one of them that its own surface asks for: a tray
+    that is turned into the body lands on surface, too, but its front stands where no turn takes it."""
     out = []
     for axis in axes:
         along = ~motions.turn & ((motions.axis @ axis).abs() > FACING)
         bodies = slid(problem, labelling, along, axis)
         if len(bodies) > max(int(along.sum()), 1):
             out.append(Motions.cat([motions[~along], bodies]))
+        for k in range(len(motions)):
+            own = slid(problem, labelling, torch.arange(len(motions)) == k, axis)
+            out += [Motions.cat([motions[:k], own[i : i + 1], motions[k + 1 :]]) for i in range(len(own))]
     return out
 
 
