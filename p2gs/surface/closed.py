@@ -30,6 +30,7 @@ FACE = 0.05  # votes that a voxel's face costs: a plate with less to say for it 
 BESIDE = 1.5  # voxels from a surface within which a point is on it
 PIECE = 0.1  # share of the largest piece's cells below which a piece goes
 LEAST = 0.05  # by which a cell of the solid is within it, of TRUNCATION: no corner of a triangle lies on a cell
+SHIFT = 0.2  # voxels by which simplifying may move a surface: a plate of one cell is half a voxel thick
 
 
 @dataclass
@@ -80,7 +81,7 @@ def close(
     seen: Mesh, done: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float
 ) -> Mesh:
     """The closed surface of a part: watertight, without self-contact, facing outwards, with ``guessed`` faces where
-    nobody saw a surface; simplified within half a voxel. Empty where there is none.
+    nobody saw a surface; simplified (``SHIFT``). Empty where there is none.
 
     seen: its surface as seen (``tsdf.fuse``).  done: the same, with guesses for unseen places, without what cannot be
     there.  views, poses, part, voxel: as in ``tsdf.fuse``.
@@ -92,11 +93,11 @@ def close(
     cells = Cells.around(np.concatenate([*points, made]), views, poses, part, voxel)
     before, after = cells.holding(kept), cells.holding(made)
     beside = _within(before, BESIDE)
-    guess = after & ~beside
+    guess = after & (~beside | (cells.sighted == 0))  # up to the seen surface, without a gap
     solid = _solid(cells, beside, guess, before & ~_within(after, BESIDE))
     if not solid.any():
         return Mesh.empty()
-    mesh = simplified(_boundary(cells, solid, guess), voxel / 2)
+    mesh = simplified(_boundary(cells, solid, guess), SHIFT * voxel)
     colours = done.colours[search_tree(done.vertices).query(mesh.vertices)[1]]
     return replace(mesh, colours=colours, guessed=_unseen(mesh, cells))
 
