@@ -104,8 +104,8 @@ def read_metrics(run: Run, metrics: dict) -> None:
             if entry["floor"] is not None:
                 run.floors[name] = entry["floor"]
         seen = metrics.get("chamfer_seen")  # runs of older builds have none
-        for name in SEEN if seen else ():
-            run.values[name] = seen[name.removeprefix("cd_").removesuffix("_seen")]["value"]
+        if seen:
+            run.values |= {name: seen[name.removeprefix("cd_").removesuffix("_seen")]["value"] for name in SEEN}
         run.failed["cd_movable"] = (chamfer["failures"], len(chamfer["parts"]))
     views = (metrics.get("views") or {}).get("mean") or {}
     run.values |= {

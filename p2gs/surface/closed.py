@@ -11,7 +11,7 @@ were seen it runs where the mean of the signed distances is zero.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import torch
@@ -23,7 +23,10 @@ from p2gs.surface.depth_view import DepthView, pixel_matrix, seen_points
 from p2gs.surface.integrate import integrate
 from p2gs.surface.tsdf import ActiveGrid
 
-TRUNCATION, BEHIND = 4.0, 1.5  # voxels before and behind a surface within which it counts (tsdf.fuse: the walls are thin)
+TRUNCATION, BEHIND = (
+    4.0,
+    1.5,
+)  # voxels before and behind a surface within which it counts (tsdf.fuse: the walls are thin)
 ENOUGH = 0.3  # weight of views at which their vote is worth half of many views' (FREE_WEIGHT: of one that sees through)
 HOLLOW = 0.3  # votes for free of a cell that nobody saw
 FACE = 0.05  # votes that a voxel's face costs: a plate with less to say for it than for two of its faces goes
@@ -53,9 +56,7 @@ class Cells:
         """Those near points [N, 3], by all views of a part (as in ``tsdf.fuse``)."""
         grid = ActiveGrid.around(torch.as_tensor(points), voxel)
         matrices = [pixel_matrix(v.camera, T) for v, T in zip(views, poses, strict=True)]
-        field, sighted, _, weight = integrate(
-            grid.centers(), views, matrices, part, TRUNCATION * voxel, BEHIND * voxel
-        )
+        field, sighted, _, weight = integrate(grid.centers(), views, matrices, part, TRUNCATION * voxel, BEHIND * voxel)
         at = tuple(grid.index.T.numpy())
         near, maps = np.zeros(grid.shape, bool), np.zeros((3, *grid.shape), np.float32)
         near[at] = True
@@ -77,9 +78,7 @@ class Cells:
         return np.where((self.weight == 0) | ((votes > 0) & ~beside), -HOLLOW, votes)
 
 
-def close(
-    seen: Mesh, done: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float
-) -> Mesh:
+def close(seen: Mesh, done: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float) -> Mesh:
     """The closed surface of a part: watertight, without self-contact, facing outwards, with ``guessed`` faces where
     nobody saw a surface; simplified (``SHIFT``). Empty where there is none.
 
@@ -125,8 +124,6 @@ def _within(cells: np.ndarray, reach: float) -> np.ndarray:
 def _solid(cells: Cells, beside: np.ndarray, guess: np.ndarray, gone: np.ndarray) -> np.ndarray:
     """Solid cells [X, Y, Z] bool, in large pieces, without voids that nobody saw. beside, guess, gone [X, Y, Z] bool:
     where surface was found, where it is guessed, and where it cannot be."""
-    from scipy.ndimage import label
-
     from p2gs.surface.cut import solid_cells
 
     votes = np.where(guess, 1.0, cells.votes(beside))
@@ -136,15 +133,23 @@ def _solid(cells: Cells, beside: np.ndarray, guess: np.ndarray, gone: np.ndarray
         for end in (0, -1):
             active[(slice(None),) * axis + (end,)] = False
     solid = solid_cells(votes, active, FACE)
-    piece = np.asarray(label(solid)[0])
+    piece = _pieces(solid)
     count = np.bincount(piece.ravel())
     count[0] = 0
     solid &= (count >= PIECE * count.max())[piece]
-    void, voids = label(~solid)
-    looked_into = np.zeros(voids + 1, bool)
-    looked_into[np.asarray(void)[~solid & (cells.field > 0.5) & (cells.weight > 0)]] = True
-    looked_into[np.asarray(void)[0, 0, 0]] = True
-    return solid | ~looked_into[np.asarray(void)]
+    void = _pieces(~solid)
+    looked_into = np.zeros(int(void.max()) + 1, bool)
+    looked_into[void[~solid & (cells.field > 0.5) & (cells.weight > 0)]] = True
+    looked_into[void[0, 0, 0]] = True  # the outside
+    return solid | ~looked_into[void]
+
+
+def _pieces(cells: np.ndarray) -> np.ndarray:
+    """The connected piece of each of the cells [X, Y, Z] bool, from 1 on, 0 where there is none."""
+    from scipy.ndimage import label
+
+    found: Any = label(cells)
+    return found[0].astype(np.int64)
 
 
 def _boundary(cells: Cells, solid: np.ndarray, guess: np.ndarray) -> Mesh:
@@ -160,8 +165,8 @@ def _boundary(cells: Cells, solid: np.ndarray, guess: np.ndarray) -> Mesh:
 
 
 def simplified(mesh: Mesh, error: float) -> Mesh:
-    """A closed mesh with as few triangles as keep its surface within ``error``, black. Raises ValueError for one that is
-    not closed."""
+    """A closed mesh with as few triangles as keep its surface within ``error``, black. Raises ValueError for one that
+    is not closed."""
     import manifold3d
 
     middle = mesh.vertices.mean(0)  # manifold3d has float32

@@ -43,10 +43,10 @@ def mesh_cameras(
 def part_meshes(
     obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION, complete: bool = True
 ) -> list[Mesh]:
-    """The parts' surfaces in the start state, in the order of ``obj.parts``, closed (``closed.close``), with ``guessed``
-    faces where nobody saw a surface; an empty mesh where no view shows a part. The base's underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed
-    (``complete_tray``), with nothing of the base left in their way (``clear_way``) or of other parts on them
-    (``not_the_trays``), and pieces of what slides joined (``join_pieces``).
+    """The parts' surfaces in the start state, in the order of ``obj.parts``, an empty mesh where no view shows a part.
+
+    They are closed (``closed.close``), with ``guessed`` faces where nobody saw a surface; what is guessed beforehand is
+    told by ``completed``.
 
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the
     object.
@@ -63,7 +63,12 @@ def part_meshes(
 
 
 def completed(obj: ArticulatedObject, seen: Sightings, shown: Sequence[Mesh]) -> list[Mesh]:
-    """The parts' surfaces as ``shown``, with guesses for what nobody saw and without what cannot be there; open."""
+    """The parts' surfaces as ``shown``, open, with guesses for what nobody saw.
+
+    The base's underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed
+    (``complete_tray``), with nothing of the base left in their way (``clear_way``) or of other parts on them
+    (``not_the_trays``), and pieces of what slides joined (``join_pieces``).
+    """
     voxel, meshes = seen.voxel, []
     for k, part in enumerate(obj.parts):
         mesh = shown[k]
@@ -167,5 +172,5 @@ def read_mesh(path: Path) -> Mesh:
             f"{path} is no mesh of p2gs, or is cut short ({err}); p2gs export RUN --format ply writes it anew"
         ) from err
     xyz, rgb = (np.stack([vertices[n] for n in names], 1) for names in (("x", "y", "z"), ("red", "green", "blue")))
-    guessed = faces["guessed"] > 0 if kind is FACE else None
+    guessed = faces["guessed"] > 0 if kind is FACE else np.zeros(len(faces), bool)
     return Mesh(xyz.astype(np.float64), faces["v"].astype(np.int64), rgb, guessed)

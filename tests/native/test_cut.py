@@ -72,7 +72,10 @@ def test_solid_cells_cost_least_of_all_sets():
 
         def cost(solid, votes=votes):
             faces = sum(int((np.diff(solid, axis=a)).sum()) for a in range(3))
-            return float(-votes[active & solid].clip(max=0).sum() + votes[active & ~solid].clip(min=0).sum()) + 0.25 * faces
+            return (
+                float(-votes[active & solid].clip(max=0).sum() + votes[active & ~solid].clip(min=0).sum())
+                + 0.25 * faces
+            )
 
         best = []
         for bits in itertools.product((False, True), repeat=len(inside)):
