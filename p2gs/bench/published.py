@@ -35,6 +35,9 @@ METRICS = {
         Metric("cd_static", "CD static"),
         Metric("cd_movable", "CD movable"),
         Metric("cd_whole", "CD whole"),
+        Metric("cd_static_seen", "CD static, seen"),
+        Metric("cd_movable_seen", "CD movable, seen"),
+        Metric("cd_whole_seen", "CD whole, seen"),
         Metric("psnr", "PSNR", 1, True),
         Metric("ssim", "SSIM", 3, True),
         Metric("lpips", "LPIPS", 3),
@@ -45,6 +48,7 @@ METRICS = {
     )
 }
 CHAMFER = ("cd_static", "cd_movable", "cd_whole")
+SEEN = tuple(f"{name}_seen" for name in CHAMFER)  # without the faces that are guessed
 
 
 @dataclass(frozen=True)

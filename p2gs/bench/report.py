@@ -11,13 +11,13 @@ from typing import Iterator, Optional
 
 from p2gs.bench import plots, write
 from p2gs.bench.grids import Entry, Grid, Row, fill, mark_best, preset_of, summarize
-from p2gs.bench.published import CHAMFER, METRICS, PaperTable, paper_table
+from p2gs.bench.published import CHAMFER, METRICS, SEEN, PaperTable, paper_table
 from p2gs.bench.results import Results, collect
 from p2gs.bench.significance import PAIRS, published_section
 from p2gs.bench.stats import Comparison, Sample, printed, sample, welch
 from p2gs.types import UserError
 
-GENERIC = ("ang", "pos", "motion", *CHAMFER, "psnr", "ssim", "lpips", "penetration", "extra", "spare", "minutes")
+GENERIC = ("ang", "pos", "motion", *CHAMFER, *SEEN, "psnr", "ssim", "lpips", "penetration", "extra", "spare", "minutes")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Optional
 
 from p2gs.bench.cell import read_record
-from p2gs.bench.published import CHAMFER
+from p2gs.bench.published import CHAMFER, SEEN
 from p2gs.stage_times import stages_file, wall_seconds
 from p2gs.types import UserError
 
@@ -103,6 +103,9 @@ def read_metrics(run: Run, metrics: dict) -> None:
             run.values[name] = entry["value"]
             if entry["floor"] is not None:
                 run.floors[name] = entry["floor"]
+        seen = metrics.get("chamfer_seen")  # runs of older builds have none
+        if seen:
+            run.values |= {name: seen[name.removeprefix("cd_").removesuffix("_seen")]["value"] for name in SEEN}
         run.failed["cd_movable"] = (chamfer["failures"], len(chamfer["parts"]))
     views = (metrics.get("views") or {}).get("mean") or {}
     run.values |= {

@@ -19,8 +19,8 @@ struct FuseArgs {
     int64_t count, part;
     float trunc, behind, free_weight;
     const float* points;  // [n, 3]
-    // signed distance [n], weight of surface sightings [n], colour [n, 3]
-    float *field, *seen, *colour;
+    // signed distance [n], weight of surface sightings [n], colour [n, 3], weight of all that went into the distance [n]
+    float *field, *seen, *colour, *weight;
 };
 
 struct FuseKernels {

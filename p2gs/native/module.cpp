@@ -87,4 +87,5 @@ NB_MODULE(_native, m) {
     bind_views(m);
     bind_assign(m);
     bind_repel(m);
+    bind_cut(m);
 }

@@ -20,31 +20,40 @@ class Triangles(Protocol):
 
 @dataclass
 class Mesh:
-    """vertices [V, 3] float64, faces [F, 3] int64, colours [V, 3] uint8 (black where none are given)."""
+    """vertices [V, 3] float64, faces [F, 3] int64, colours [V, 3] uint8 (black where none are given), guessed [F] bool:
+    faces that close what nobody saw (none where it is not said)."""
 
     vertices: np.ndarray
     faces: np.ndarray
     colours: np.ndarray = field(default=None)  # type: ignore[assignment]
+    guessed: np.ndarray = field(default=None)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         if self.colours is None:
             self.colours = np.zeros((len(self.vertices), 3), np.uint8)
+        if self.guessed is None:
+            self.guessed = np.zeros(len(self.faces), bool)
 
     def transformed(self, T: np.ndarray) -> "Mesh":
         """The mesh after the affine map T [4, 4]."""
-        return Mesh(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces, self.colours)
+        return Mesh(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces, self.colours, self.guessed)
+
+    def only(self, kept: np.ndarray) -> "Mesh":
+        """The triangles ``kept`` [F] bool, and the vertices that they have."""
+        return Mesh(self.vertices, self.faces[kept], self.colours, self.guessed[kept]).without_unused()
 
     def without_unused(self) -> "Mesh":
         """Without vertices that no triangle has."""
         used, renumbered = np.unique(self.faces, return_inverse=True)
-        return Mesh(self.vertices[used], renumbered.reshape(-1, 3), self.colours[used])
+        return Mesh(self.vertices[used], renumbered.reshape(-1, 3), self.colours[used], self.guessed)
 
     @staticmethod
     def join(meshes: Sequence["Mesh"]) -> "Mesh":
         """One mesh of several."""
         offsets = np.cumsum([0] + [len(m.vertices) for m in meshes])
         faces = [m.faces + o for m, o in zip(meshes, offsets, strict=False)]
-        return Mesh(*(np.concatenate(x) for x in ([m.vertices for m in meshes], faces, [m.colours for m in meshes])))
+        lists = ([m.vertices for m in meshes], faces, [m.colours for m in meshes], [m.guessed for m in meshes])
+        return Mesh(*(np.concatenate(x) for x in lists))
 
     @staticmethod
     def empty() -> "Mesh":
@@ -76,10 +85,10 @@ def largest_components(mesh: Mesh, fraction: float = 0.1, weld: bool = False) ->
         return mesh
     label = components(mesh, weld)
     count = np.bincount(label)
-    return Mesh(mesh.vertices, mesh.faces[count[label] >= fraction * count.max()], mesh.colours).without_unused()
+    return mesh.only(count[label] >= fraction * count.max())
 
 
 def connected(mesh: Mesh) -> list[Mesh]:
     """The mesh's connected components."""
     label = components(mesh)
-    return [Mesh(mesh.vertices, mesh.faces[label == k], mesh.colours).without_unused() for k in np.unique(label)]
+    return [mesh.only(label == k) for k in np.unique(label)]

@@ -16,6 +16,7 @@ ground truth.
                  psnr_masked over the object's pixels only, alpha_error mean |alpha - mask|, depth_* of |expected depth
                  - true| on the object, depth_bad the fraction off by more than 1 % of the object's diagonal
     chamfer      {static|movable|whole: {value, floor}, parts, failures}: x1000, see metrics.chamfer.ChamferReport
+    chamfer_seen the same of the meshes without the faces that close what nobody saw
     penetration  {mean, max}: fraction of the moving Gaussians inside the base, over five states
     slots        with exact_parts: what became of every part slot, see models.slots.slot_report
     seconds      time the evaluation took
@@ -70,7 +71,8 @@ def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict
         joints.update([p.joint for p in obj.parts if p.joint is not None], truth.joints)
         metrics["joints"] = joints.report.to_dict()
         chamfer = surface_scores(run_dir, truth, joints.report.assignment, missing)
-        metrics |= {} if chamfer is None else {"chamfer": chamfer}
+        if chamfer is not None:
+            metrics["chamfer"], metrics["chamfer_seen"] = chamfer
     with rasterizer_of(run_dir):
         metrics["views"] = view_scores(obj, scene, missing)
     inside = Penetration()
@@ -151,11 +153,12 @@ def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]
 
 def surface_scores(
     run_dir: Path, truth: "GroundTruth", assignment: dict[int, int], missing: list[str]
-) -> Optional[dict]:
-    """Chamfer distances of RUN/meshes against the ground truth's; None where either is missing."""
+) -> Optional[tuple[dict, dict]]:
+    """Chamfer distances of RUN/meshes against the ground truth's, and of their faces that are not guessed; None where
+    either is missing."""
     from p2gs.metrics.chamfer import PartMeshes, is_empty, read_part_meshes
 
-    pred, gt = {}, {}
+    pred, seen, gt = {}, {}, {}
     for state, name in enumerate(STATES):
         made, true = read_meshes(run_dir, name), truth.meshes(state)
         if made is None:
@@ -168,14 +171,19 @@ def surface_scores(
         pred[name] = PartMeshes(
             made[0], made[1:], read_mesh(Path(run_dir) / "meshes" / name / "whole.ply") if whole_apart else None
         )
+        shown = [m.only(~m.guessed) for m in made]
+        seen[name] = PartMeshes(shown[0], shown[1:], pred[name].whole)
         gt[name] = read_part_meshes(true.whole, true.static, true.dynamic)
-    chamfer = PartChamfer()
-    chamfer.update(pred, gt, assignment)
-    if chamfer.report.static is None:
+    reports = []
+    for meshes in (pred, seen):
+        chamfer = PartChamfer()
+        chamfer.update(meshes, gt, assignment)
+        reports.append(chamfer.report)
+    if reports[0].static is None:
         bare = all(m.static is None or is_empty(m.static) for m in gt.values())
         whose = "ground truth's" if bare else "twin's"
         missing.append(f"the {whose} static part has no surface, so there is no Chamfer distance of it")
-    return chamfer.report.to_dict()
+    return reports[0].to_dict(), reports[1].to_dict()
 
 
 def _means(rows: list[dict]) -> dict[str, float]:

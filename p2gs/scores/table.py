@@ -14,7 +14,7 @@ def score_tables(metrics: dict) -> Any:
         t
         for t in (
             joint_table(metrics.get("joints")),
-            chamfer_table(metrics.get("chamfer")),
+            chamfer_table(metrics.get("chamfer"), metrics.get("chamfer_seen")),
             view_table(metrics.get("views")),
         )
         if t
@@ -43,13 +43,15 @@ def joint_table(joints: Optional[dict]) -> Any:
     return table
 
 
-def chamfer_table(chamfer: Optional[dict]) -> Any:
-    """Chamfer distances x1000 with the sampling floor beside each."""
+def chamfer_table(chamfer: Optional[dict], seen: Optional[dict] = None) -> Any:
+    """Chamfer distances x1000, with the sampling floor beside each; ``seen``: those without guessed faces, where they
+    were measured."""
     if not chamfer:
         return None
-    table = _table("Chamfer x1000", "value", "sampling floor")
+    table = _table("Chamfer x1000", "value", *(["without guesses"] if seen else []), "sampling floor")
     for name in ("static", "movable", "whole"):
-        table.add_row(name, _num(chamfer[name]["value"]), _num(chamfer[name]["floor"]))
+        values = [chamfer[name]["value"], *([seen[name]["value"]] if seen else []), chamfer[name]["floor"]]
+        table.add_row(name, *map(_num, values))
     return table
 
 

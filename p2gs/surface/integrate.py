@@ -17,9 +17,9 @@ FREE_WEIGHT = 0.3
 
 def integrate(
     points: Tensor, views: Sequence[DepthView], matrices: Sequence[Tensor], part: int, trunc: float, behind: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Signed distance in units of trunc [n], weight of surface sightings [n] and colour [n, 3] at points [n, 3]
-    float32.
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Signed distance in units of trunc [n], weight of surface sightings [n], colour [n, 3] and weight of all that the
+    distance is the mean of [n], at points [n, 3] float32.
 
     views: with normals, float32 maps and int64 labels, all on the CPU.  matrices: ``pixel_matrix`` of each.  part: in
     ``views``.
@@ -45,7 +45,7 @@ def integrate(
         kept.append((depth, view.labels.long().contiguous(), dot, cosine, colour))
         rows.append([m.data_ptr() for m in kept[-1]] + [view.camera.width, view.camera.height])
     points, n = points.float().contiguous(), len(points)
-    out = [torch.empty(n), torch.empty(n), torch.empty(n, 3)]
+    out = [torch.empty(n), torch.empty(n), torch.empty(n, 3), torch.empty(n)]
     table = torch.tensor(rows, dtype=torch.int64).reshape(-1, 7)
     lines = torch.stack(list(matrices)).float().contiguous() if len(rows) else torch.zeros(0, 3, 4)
     limits, addresses = [trunc, behind, FREE_WEIGHT], [t.data_ptr() for t in out]
@@ -57,7 +57,7 @@ def integrate(
 
 def integrate_reference(
     points: Tensor, views: Sequence[DepthView], matrices: Sequence[Tensor], part: int, trunc: float, behind: float
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """``integrate``, its shapes too, in torch, in the dtype of ``points``."""
     maps = [_pixel_table(v, part).to(points) for v in views]
     matrices = [M.to(points) for M in matrices]
@@ -78,7 +78,7 @@ def _pixel_table(view: DepthView, part: int) -> Tensor:
     return torch.cat([table, torch.tensor([[-1e9, 1.0, 0, 0, 0, 0]])])
 
 
-def _chunk(x: Tensor, views, maps, matrices, trunc: float, behind: float) -> tuple[Tensor, Tensor, Tensor]:
+def _chunk(x: Tensor, views, maps, matrices, trunc: float, behind: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     total, weight = x.new_zeros(len(x)), x.new_full((len(x),), 1e-9)
     tint = x.new_full((len(x), 4), 1e-9)
     columns = x.T.contiguous()
@@ -97,4 +97,4 @@ def _chunk(x: Tensor, views, maps, matrices, trunc: float, behind: float) -> tup
         tint[:, 0] += near
         tint[:, 1:] += near[:, None] * row[:, 3:]
     seen = tint[:, 0]
-    return total / weight, torch.where(seen > 1e-7, seen, torch.zeros_like(seen)), tint[:, 1:] / seen[:, None]
+    return total / weight, torch.where(seen > 1e-7, seen, torch.zeros_like(seen)), tint[:, 1:] / seen[:, None], weight

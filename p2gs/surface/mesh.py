@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Optional, Sequence
 
@@ -12,10 +13,12 @@ import torch
 from p2gs.gaussians.paint import rasterizer_of
 from p2gs.gaussians.twin_json import load_twin
 from p2gs.gaussians.views import NamedCamera, orbit, read_cameras
+from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.closed import close
 from p2gs.surface.pieces import join_pieces
 from p2gs.surface.protocol import largest_clusters, separate_whole, surface_options
-from p2gs.surface.sightings import RESOLUTION, TRUNCATION, sight, start_motion
+from p2gs.surface.sightings import RESOLUTION, TRUNCATION, Sightings, sight, start_motion
 from p2gs.surface.trays import clear_way, complete_tray, not_the_trays
 from p2gs.surface.unseen import close_unseen_sides
 from p2gs.types import ArticulatedObject, Camera, UserError
@@ -40,24 +43,50 @@ def mesh_cameras(
 
 
 def part_meshes(
-    obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION, complete: bool = True
+    obj: ArticulatedObject,
+    cameras: Sequence[tuple[int, Camera]],
+    resolution: int = RESOLUTION,
+    complete: bool = True,
+    closed: bool = False,
 ) -> list[Mesh]:
-    """The parts' surfaces in the start state, in the order of ``obj.parts``; an empty mesh where no view shows a part.
-    The base's underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed
-    (``complete_tray``), with nothing of the base left in their way (``clear_way``) or of other parts on them
-    (``not_the_trays``), and pieces of what slides joined (``join_pieces``).
+    """The parts' surfaces in the start state, in the order of ``obj.parts``, an empty mesh where no view shows a part.
+
+    ``guessed`` are the faces where nobody saw a surface: those that ``completed`` adds, and where it is ``closed``.
 
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the
     object.
-    complete: off, there is only what was seen.
+    complete: off, there is only what was seen, and the meshes are open.  closed: watertight (``closed.close``).
     """
     seen = sight(obj, cameras, resolution)
+    shown = [seen.surface(k) for k in range(len(obj.parts))]
     if not complete:
-        return [seen.surface(k) for k in range(len(obj.parts))]
-    voxel = seen.voxel
-    meshes = []
+        return shown
+    done = completed(obj, seen, shown)
+    if not closed:
+        return [replace(b, guessed=_added(a, b)) for a, b in zip(shown, done, strict=True)]
+    return [
+        close(a, b, seen.views, seen.poses[k], k, seen.voxel) for k, (a, b) in enumerate(zip(shown, done, strict=True))
+    ]
+
+
+def _added(shown: Mesh, done: Mesh) -> np.ndarray:
+    """Faces [F] bool of ``done`` that ``shown`` does not have."""
+    if not len(shown.faces) or not len(done.faces):
+        return np.ones(len(done.faces), bool)
+    middles = [m.vertices[m.faces].mean(1) for m in (shown, done)]
+    return search_tree(middles[0]).query(middles[1])[0] > 0
+
+
+def completed(obj: ArticulatedObject, seen: Sightings, shown: Sequence[Mesh]) -> list[Mesh]:
+    """The parts' surfaces as ``shown``, open, with guesses for what nobody saw.
+
+    The base's underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed
+    (``complete_tray``), with nothing of the base left in their way (``clear_way``) or of other parts on them
+    (``not_the_trays``), and pieces of what slides joined (``join_pieces``).
+    """
+    voxel, meshes = seen.voxel, []
     for k, part in enumerate(obj.parts):
-        mesh = seen.surface(k)
+        mesh = shown[k]
         if part.joint is None:
             mesh = close_unseen_sides(mesh, seen.views, seen.poses[k], k, voxel, TRUNCATION * voxel)
         meshes.append(mesh)
@@ -90,7 +119,7 @@ def write_meshes(run_dir: Path | str, resolution: int = RESOLUTION, log=None) ->
         obj = largest_clusters(obj, options.cluster)
     with rasterizer_of(run_dir):
         cameras = mesh_cameras(obj, read_cameras(run_dir / "cameras.json"))
-        meshes = part_meshes(obj, cameras, resolution, options.complete)
+        meshes = part_meshes(obj, cameras, resolution, options.complete, options.closed)
         wholes = [separate_whole(obj, cameras, t, resolution) for t in (0, 1)] if options.whole == "separate" else None
     if not any(len(m.faces) for m in meshes):
         raise UserError(f"{run_dir}: the twin shows no surface from any of its cameras, so there is nothing to mesh")
@@ -117,17 +146,18 @@ def read_meshes(run_dir: Path | str, state: str = "start") -> Optional[list[Mesh
 
 
 VERTEX = np.dtype([(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
-FACE = np.dtype([("n", "u1"), ("v", "<i4", 3)])
+FACE = np.dtype([("n", "u1"), ("v", "<i4", 3), ("guessed", "u1")])
+OLD_FACE = np.dtype([("n", "u1"), ("v", "<i4", 3)])  # before faces said whether they are guessed
 
 
 def write_mesh(path: Path, mesh: Mesh) -> Path:
-    """Binary PLY with vertex colours."""
+    """Binary PLY with vertex colours and, by face, uchar ``guessed``: 1 where it closes what nobody saw."""
     vertices, faces = np.zeros(len(mesh.vertices), VERTEX), np.zeros(len(mesh.faces), FACE)
     for i, name in enumerate(("x", "y", "z")):
         vertices[name] = mesh.vertices[:, i]
     for i, name in enumerate(("red", "green", "blue")):
         vertices[name] = mesh.colours[:, i]
-    faces["n"], faces["v"] = 3, mesh.faces
+    faces["n"], faces["v"], faces["guessed"] = 3, mesh.faces, mesh.guessed
     lines = [
         "ply",
         "format binary_little_endian 1.0",
@@ -135,7 +165,8 @@ def write_mesh(path: Path, mesh: Mesh) -> Path:
         *(f"property float {n}" for n in "xyz"),
     ]
     lines += [f"property uchar {n}" for n in ("red", "green", "blue")]
-    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    lines += ["property uchar guessed", "end_header"]
     path.write_bytes(("\n".join(lines) + "\n").encode() + vertices.tobytes() + faces.tobytes())
     return path
 
@@ -147,7 +178,8 @@ def read_mesh(path: Path) -> Mesh:
     try:
         counts = [int(line.split()[2]) for line in head.decode().splitlines() if line.startswith("element")]
         vertices = np.frombuffer(body, VERTEX, counts[0])
-        faces = np.frombuffer(body, FACE, counts[1], offset=counts[0] * VERTEX.itemsize)
+        kind = FACE if b"property uchar guessed" in head else OLD_FACE
+        faces = np.frombuffer(body, kind, counts[1], offset=counts[0] * VERTEX.itemsize)
         if min(counts) < 0 or (len(faces) and (faces["v"].min() < 0 or faces["v"].max() >= len(vertices))):
             raise ValueError("a face has a vertex that is not there")
     except (ValueError, IndexError, OverflowError) as err:
@@ -155,4 +187,5 @@ def read_mesh(path: Path) -> Mesh:
             f"{path} is no mesh of p2gs, or is cut short ({err}); p2gs export RUN --format ply writes it anew"
         ) from err
     xyz, rgb = (np.stack([vertices[n] for n in names], 1) for names in (("x", "y", "z"), ("red", "green", "blue")))
-    return Mesh(xyz.astype(np.float64), faces["v"].astype(np.int64), rgb)
+    guessed = faces["guessed"] > 0 if kind is FACE else np.zeros(len(faces), bool)
+    return Mesh(xyz.astype(np.float64), faces["v"].astype(np.int64), rgb, guessed)

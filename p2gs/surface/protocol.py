@@ -19,10 +19,11 @@ from p2gs.types import ArticulatedObject, Camera, Part, UserError
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """``complete``, ``whole`` and ``cluster`` of ``phases.finish`` (``models.finish.FinishConfig`` says what they
+    """``complete``, ``closed``, ``whole`` and ``cluster`` of ``phases.finish`` (``models.finish.FinishConfig`` says what they
     mean)."""
 
     complete: bool = True
+    closed: bool = False
     whole: Literal["joined", "separate"] = "joined"
     cluster: float = 0.0
 
@@ -41,7 +42,7 @@ def surface_options(run_dir: Path | str) -> SurfaceOptions:
         return SurfaceOptions(**{f.name: given[f.name] for f in fields(SurfaceOptions) if f.name in given})
     except (yaml.YAMLError, AttributeError, ValueError, TypeError, RecursionError, OverflowError) as err:
         raise UserError(
-            f"{path}: phases.finish cannot be read ({err}); expected a mapping with complete, whole and cluster"
+            f"{path}: phases.finish cannot be read ({err}); expected a mapping with complete, closed, whole and cluster"
         ) from err
 
 

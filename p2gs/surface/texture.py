@@ -99,7 +99,7 @@ def bake(mesh: Mesh, seen: Sightings, part: int) -> Texture:
     colour = (mesh.colours[mesh.faces[triangle]] * weights[..., None]).sum(1) / 255
     matrices = [pixel_matrix(v.camera, T) for v, T in zip(seen.views, seen.poses[part], strict=True)]
     reach = (TRUNCATION * seen.voxel, BEHIND * seen.voxel)
-    _, weight, tint = integrate(torch.from_numpy(points).float(), seen.views, matrices, part, *reach)
+    _, weight, tint, _ = integrate(torch.from_numpy(points).float(), seen.views, matrices, part, *reach)
     told = (weight > 0).numpy()
     colour[told] = tint.numpy()[told]
     image = np.zeros((height, width, 3), np.uint8)

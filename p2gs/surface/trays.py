@@ -296,7 +296,7 @@ def _without_strays(mesh: Mesh, tray: Tray, reach: float) -> Mesh:
 
 def _without(mesh: Mesh, gone: np.ndarray) -> Mesh:
     """The mesh without the triangles ``gone`` [F] bool; itself where there are none."""
-    return Mesh(mesh.vertices, mesh.faces[~gone], mesh.colours).without_unused() if gone.any() else mesh
+    return mesh.only(~gone) if gone.any() else mesh
 
 
 def _centre(mesh: Mesh) -> np.ndarray:

@@ -38,7 +38,7 @@ def fuse(
         return Mesh.empty()
     grid = ActiveGrid.around(points, voxel)
     matrices = [pixel_matrix(v.camera, T) for v, T in zip(views, poses, strict=True)]
-    field, weight, colour = integrate(grid.centers(), views, matrices, part, trunc, behind)
+    field, weight, colour, _ = integrate(grid.centers(), views, matrices, part, trunc, behind)
     return grid.surface(field, weight > 0, colour)
 
 

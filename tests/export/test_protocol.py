@@ -2,6 +2,7 @@
 Gaussians."""
 
 import pytest
+import trimesh
 from toy import toy_scene, toy_twin
 
 from p2gs.export.run_folder import write_twin
@@ -17,9 +18,9 @@ from p2gs.types import UserError
 def test_options_are_read_from_the_runs_config(tmp_path):
     assert surface_options(tmp_path) == SurfaceOptions()
     (tmp_path / "config.yaml").write_text(
-        "phases: {finish: {complete: false, whole: separate, cluster: 0.05, trays: 0}}"
+        "phases: {finish: {complete: false, closed: false, whole: separate, cluster: 0.05, trays: 0}}"
     )
-    assert surface_options(tmp_path) == SurfaceOptions(False, "separate", 0.05)
+    assert surface_options(tmp_path) == SurfaceOptions(False, False, "separate", 0.05)
     (tmp_path / "config.yaml").write_text("phases: [1]")
     with pytest.raises(UserError, match="expected a mapping"):
         surface_options(tmp_path)
@@ -49,6 +50,18 @@ def test_nothing_is_completed_where_it_is_not_wanted():
         assert (mesh.faces == seen.surface(k).faces).all()
     full = part_meshes(twin, cameras, 40)
     assert sum(len(m.faces) for m in full) != sum(len(m.faces) for m in bare)
+    assert not any(m.guessed.any() for m in bare)
+    for part, all_of_it in zip(bare, full, strict=True):
+        assert int((~all_of_it.guessed).sum()) <= len(part.faces)  # what is not guessed was seen
+    assert any(m.guessed.any() for m in full)
+
+
+def test_closed_meshes_are_watertight_and_say_what_is_guessed():
+    twin = toy_twin()
+    cameras = [(c.state, c.camera) for c in scene_cameras(toy_scene())]
+    for mesh in part_meshes(twin, cameras, 40, closed=True):
+        assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
+        assert mesh.guessed.any() and not mesh.guessed.all()
 
 
 def test_the_whole_of_its_own_is_written_and_scored(tmp_path):

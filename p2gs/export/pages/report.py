@@ -138,8 +138,13 @@ def score_section(metrics: Optional[dict]) -> str:
         out.append(table(head, rows))
     chamfer = metrics.get("chamfer")
     if chamfer:
-        rows = [[k, _number(chamfer[k]["value"]), _number(chamfer[k]["floor"])] for k in ("static", "movable", "whole")]
-        out.append(table(["Chamfer x1000", "value", "sampling floor"], rows))
+        seen = metrics.get("chamfer_seen")  # runs of older builds have none
+        shown = {"value": chamfer, **({"without guesses": seen} if seen else {})}
+        rows = [
+            [k, *(_number(scores[k]["value"]) for scores in shown.values()), _number(chamfer[k]["floor"])]
+            for k in ("static", "movable", "whole")
+        ]
+        out.append(table(["Chamfer x1000", *shown, "sampling floor"], rows))
     if metrics.get("missing"):
         out.append('<ul class="notes">' + "".join(f"<li>{html.escape(m)}</li>" for m in metrics["missing"]) + "</ul>")
     return "\n".join(out)

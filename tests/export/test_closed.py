@@ -1,0 +1,110 @@
+"""Closed parts: watertight, where the true surface is, thin walls with two sides, no lid over what was seen empty."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from toy import look_at, ring
+from traced import CRATE, boards, seen
+
+from p2gs.metrics.chamfer import sample_surface
+from p2gs.ops.mesh import Mesh
+from p2gs.surface.closed import close, points_on, simplified
+from p2gs.surface.tsdf import fuse
+from p2gs.surface.unseen import close_unseen_sides
+
+EYE = torch.eye(4, dtype=torch.float64)
+VOXEL = 0.03
+BLOCK = boards(((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3)))
+
+
+def closed(primitives, cameras, voxel=VOXEL, complete=True):
+    views = [seen(primitives, len(primitives), c, 2 * voxel) for c in cameras]
+    poses = [EYE] * len(views)
+    mesh = fuse(views, poses, 0, voxel, 4 * voxel, 2 * voxel)
+    done = close_unseen_sides(mesh, views, poses, 0, voxel, 4 * voxel) if complete else mesh
+    return close(mesh, done, views, poses, 0, voxel)
+
+
+def solid_of(mesh: Mesh) -> trimesh.Trimesh:
+    out = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert out.is_watertight and out.is_winding_consistent and out.volume > 0
+    return out
+
+
+def to_boxes(points, boxes):
+    """Distance of points [N, 3] from the surface of the union of boxes, negative within one."""
+    distances = []
+    for lo, hi in np.array(boxes):
+        q = np.abs(points - (lo + hi) / 2) - (hi - lo) / 2
+        distances.append(np.linalg.norm(q.clip(min=0), axis=1) + q.max(1).clip(max=0))
+    return np.min(distances, 0)
+
+
+WALLS = [
+    ((-0.5, -0.4, -0.3), (-0.46, 0.4, 0.3)),
+    ((-0.5, -0.4, -0.3), (0.5, -0.36, 0.3)),
+    ((-0.5, 0.36, -0.3), (0.5, 0.4, 0.3)),
+    ((-0.5, -0.4, -0.3), (0.5, 0.4, -0.26)),
+    ((-0.5, -0.4, 0.26), (0.5, 0.4, 0.3)),
+]
+
+
+def test_a_block_is_closed_by_its_guessed_underside():
+    mesh = closed(BLOCK, ring(12, 160, elevations=(15.0, 40.0)))
+    solid = solid_of(mesh)
+    assert solid.volume == pytest.approx(0.48, rel=0.06)  # nobody saw its inside: it is filled
+    down = solid.face_normals[:, 2] < -0.8
+    guessed = solid.area_faces[mesh.guessed]
+    assert guessed.sum() == pytest.approx(0.8, rel=0.1)
+    assert solid.area_faces[down & ~mesh.guessed].sum() < 0.08
+    shown = sample_surface(mesh.only(~mesh.guessed), 3000)  # rims, where depth has an edge, reach out by a voxel or two
+    assert np.quantile(np.abs(to_boxes(shown, [((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))])), 0.9) < 0.5 * VOXEL
+
+
+def test_an_open_box_has_no_lid_and_walls_with_two_sides():
+    cameras = ring(16, 160, elevations=(20.0, -20.0))
+    mesh = closed(CRATE, cameras, voxel := 0.02)
+    solid = solid_of(mesh)
+    inside = np.random.default_rng(0).uniform((-0.4, -0.3, -0.2), (0.6, 0.3, 0.2), (300, 3))
+    assert not solid.contains(inside).any()  # up to before its mouth
+    middle = np.array([[-0.48, 0, 0], [0, -0.38, 0], [0, 0.38, 0], [0, 0, -0.28], [0, 0, 0.28]])
+    assert solid.contains(middle).all()
+    off = np.abs(to_boxes(sample_surface(mesh.only(~mesh.guessed), 3000), WALLS))
+    assert np.quantile(off, 0.8) < 0.5 * voxel and off.max() < 3 * voxel
+
+
+def test_a_plate_of_which_one_side_was_seen_gets_a_guessed_back():
+    plate = boards(((-0.4, -0.02, -0.4), (0.4, 0.02, 0.4)))
+    mesh = closed(plate, [look_at((x, -2.5, 0.3), (0, 0, 0)) for x in (-0.6, 0.0, 0.6)], complete=False)
+    solid = solid_of(mesh)
+    middle = solid.triangles_center
+    front = middle[:, 1] < -0.01
+    assert solid.area_faces[front & mesh.guessed].sum() < 0.1 < 0.5 < solid.area_faces[front & ~mesh.guessed].sum()
+    assert solid.area_faces[~front & mesh.guessed].sum() > 0.5
+    assert middle[:, 1].max() < -0.02 + 3 * VOXEL  # thin
+
+
+def test_a_part_that_nobody_saw_is_empty():
+    assert len(close(Mesh.empty(), Mesh.empty(), [], [], 0, VOXEL).faces) == 0
+
+
+def test_points_on_a_mesh_leave_no_gaps():
+    mesh = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0.1, 0], [0, 0, 0.05]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    points = points_on(mesh, 0.1)
+    u = np.random.default_rng(0).dirichlet((1, 1, 1), 200) @ mesh.vertices[[0, 1, 2]]
+    gap = np.linalg.norm(u[:, None] - points, axis=2).min(1)
+    assert gap.max() < 0.05 and len(points_on(Mesh.empty(), 0.1)) == 0
+
+
+def test_simplified_meshes_stay_closed_and_near():
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    out = simplified(Mesh(ball.vertices + 7, ball.faces), 0.01)
+    solid = solid_of(out)
+    radius = np.linalg.norm(sample_surface(out, 2000) - 7, axis=1)
+    assert len(out.faces) < len(ball.faces) / 4 and np.abs(radius - 1).max() < 0.015
+    assert solid.volume == pytest.approx(4 / 3 * math.pi, rel=0.02)
+    with pytest.raises(ValueError, match="not closed"):
+        simplified(Mesh(ball.vertices, ball.faces[1:]), 0.01)
