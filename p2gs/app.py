@@ -226,7 +226,7 @@ def parser(prog: str = "p2gs") -> Parser:
 
     bench = add(
         "bench",
-        "run objects x settings x seeds; bench kernels, bench scaling, bench peers: time the rasterizers, growth, others",
+        "run objects x settings x seeds; bench kernels, scaling, peers: rasterizers, growth, another program",
         epilog=BENCH_HELP,
     )
     bench.set_defaults(action="runs")

@@ -73,8 +73,8 @@ def run_bench(
 
 
 def result(cell: Cell, job) -> Outcome:
-    """What became of a job. A failure of the machinery (a lost node, a killed worker) is the run's failure, noted in its
-    folder, and ``lost``: unlike a run that failed by itself it may well succeed elsewhere."""
+    """What became of a job. A failure of the machinery (a lost node, a killed worker) is the run's failure, noted in
+    its folder, and ``lost``: unlike a run that failed by itself it may well succeed elsewhere."""
     try:
         return job.result()
     except Exception as err:

@@ -249,7 +249,9 @@ def main(words: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="p2gs bench scaling", description="How a state's time and memory grow with pixels, views and Gaussians."
     )
-    parser.add_argument("--out", type=Path, default=Path("runs/bench/scaling"), metavar="DIR", help="default %(default)s")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/bench/scaling"), metavar="DIR", help="default %(default)s"
+    )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="default 1, timed in CPU time")
     parser.add_argument("--steps", type=int, default=40, metavar="N", help="of a measurement (default 40)")
     parser.add_argument("--quick", action="store_true", help="small sizes, a minute: does it run?")
