@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from contextlib import redirect_stdout
@@ -267,35 +266,3 @@ def test_a_run_that_ended_though_its_job_was_lost_is_not_run_twice(bench_file, p
     bench = read_bench([bench_file(ONE)])
     assert run(bench, program)[0] == {"done": 2}
     assert len(program.calls("fit")) == 2 and all(read_record(c.run)["status"] == "done" for c in bench.cells)
-
-
-def test_a_node_of_ray_that_is_killed_costs_no_run(bench_file, program, monkeypatch):
-    """Two nodes with two runs each; one is killed when a third of the runs are done."""
-    pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    monkeypatch.setenv("FAKE_P2GS_SLEEP", "0.5")
-    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2})
-    try:
-        node = cluster.add_node(num_cpus=2)
-        cluster.wait_for_nodes()
-        text = f"settings: {{full: {{}}}}\nseeds: {list(range(12))}\nexecutor: ray\n"
-        bench = read_bench([bench_file(f"{text}ray: {{cpus: 1, address: '{cluster.address}'}}\n")])
-        ended = threading.Event()
-
-        def kill():
-            while sum(map(is_done, bench.cells)) < 8 and not ended.wait(0.05):
-                pass
-            cluster.remove_node(node, allow_graceful=False)
-
-        killer = threading.Thread(target=kill)
-        killer.start()
-        counts, _ = run(bench, program)
-        ended.set()
-        killer.join()
-    finally:
-        cluster.shutdown()
-    assert counts == {"done": 24} and all(is_done(c) for c in bench.cells)
-    assert len(program.calls("test")) == 24, "none counted twice"
-    assert 24 <= len(program.calls("fit")) <= 24 + 2, "only what ran on that node is begun again"
