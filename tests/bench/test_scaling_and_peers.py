@@ -69,7 +69,10 @@ def test_peers(scene, program, tmp_path, capsys):
         assert [p["step"] for p in points] == list(range(2, 41, 2))
         assert all(a["seconds"] <= b["seconds"] for a, b in zip(points, points[1:], strict=False))
     text = capsys.readouterr().out
-    assert "| test PSNR, dB | p2gs, s | splatter, s | times as long |" in text and "splatter: 40 steps in" in text
+    assert (
+        "| test PSNR, dB | p2gs, s (CPU s) | splatter, s (CPU s) | times as long (in CPU time) |" in text
+        and "splatter: 40 steps in" in text
+    )
     frames = json.loads((tmp_path / "out" / "project" / "transforms.json").read_text())["frames"]
     assert len(frames) == 7  # nine less every eighth, which are the test views
 
@@ -82,8 +85,8 @@ def test_the_same_views_for_both(scene):
 
 
 def test_time_to_a_level():
-    points = [peers.Point(1.0, 10, 20.0, 1), peers.Point(2.0, 20, 25.0, 1), peers.Point(3.0, 30, 24.0, 1)]
-    assert [peers.time_to(points, x) for x in (19, 20.5, 25, 26)] == [1.0, 2.0, 2.0, None]
+    points = [peers.Point(s, s / 2, 10, db, 1) for s, db in ((1.0, 20.0), (2.0, 25.0), (3.0, 24.0))]
+    assert [p and p.seconds for p in (peers.time_to(points, x) for x in (19, 20.5, 25, 26))] == [1.0, 2.0, 2.0, None]
 
 
 @pytest.mark.parametrize(
