@@ -234,7 +234,8 @@ def markdown(ours: Sequence[Point], theirs: Sequence[Point], name: str) -> str:
     """Time to equal test PSNR, and where each ended."""
     best = [max(p.psnr for p in points) for points in (ours, theirs)]
     common = min(best)
-    levels = np.arange(np.floor(common / LEVEL) * LEVEL, common - 10, -LEVEL)[::-1]
+    first = min(ours[0].psnr, theirs[0].psnr)  # lower levels say nothing: both have them at their first snapshot
+    levels = np.arange(np.floor(common / LEVEL) * LEVEL, first, -LEVEL)[::-1]
     lines = [
         f"| test PSNR, dB | p2gs, s (CPU s) | {name}, s (CPU s) | times as long (in CPU time) |",
         "|---:|---:|---:|---:|",

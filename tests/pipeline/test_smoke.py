@@ -1,5 +1,5 @@
-"""``preset/smoke.yaml`` has a surface to show to discovery, whatever it is trained on: a thin object fills a twentieth of
-a picture. Whole runs over all kinds of objects: tests/faults/test_smoke_on_any_scene.py."""
+"""``preset/smoke.yaml`` has a surface to show to discovery, whatever it is trained on: a thin object fills a twentieth
+of a picture. Whole runs over all kinds of objects: tests/faults/test_smoke_on_any_scene.py."""
 
 import torch
 
