@@ -16,7 +16,7 @@ import subprocess
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Optional, Sequence
+from typing import Any, Optional, Sequence
 
 import numpy as np
 import torch
@@ -61,7 +61,7 @@ class Task:
     test: TrainingViews
 
 
-def make_task(root: str, state: int, words: Sequence[str]) -> tuple[Task, object]:
+def make_task(root: str, state: int, words: Sequence[str]) -> tuple[Task, Any]:
     """The state's views, and the config of ``preset/cpu.yaml`` with the words laid on it. Raises UserError."""
     from dataclasses import replace
 
@@ -96,24 +96,17 @@ def score(g: GaussianTensors, test: TrainingViews) -> float:
 
 def train_ours(task: Task, cfg, folder: Path) -> list[Point]:
     """Our single state, scored at ``SNAPSHOTS`` moments."""
-    from lightning.pytorch import Trainer
-
+    from p2gs.bench.bare import train_bare
     from p2gs.callbacks.base import Callback
-    from p2gs.data.base import TwoStateData
     from p2gs.models.single_state import SingleStatePhase
 
     section, points = cfg.phases["single_state"], []
+    build: Any = SingleStatePhase
     train = task.scene.select(state=task.state, split="train")
     began, began_cpu = time.perf_counter(), time.process_time()
     views = TrainingViews(train, section.config.levels)
-    phase = SingleStatePhase(section.config, section.losses, task.scene, task.state, views, seed=cfg.seed)
+    phase = build(section.config, section.losses, task.scene, task.state, views, seed=cfg.seed)
     every = max(phase.total_steps // SNAPSHOTS, 1)
-
-    class Views(TwoStateData):
-        """The phase has its views; this says which of them a step looks at."""
-
-        def setup(self, stage=None):
-            pass
 
     class Scores(Callback):
         changes_result = False
@@ -132,10 +125,7 @@ def train_ours(task: Task, cfg, folder: Path) -> list[Point]:
     deciding = [c for c in section.new_callbacks().values() if c.changes_result]
     for callback in deciding:
         callback.prepare(cfg, task.scene)
-    quiet = ("logger", "enable_progress_bar", "enable_model_summary", "enable_checkpointing")
-    options = {"max_steps": phase.total_steps, "max_epochs": -1, "accelerator": "cpu", "default_root_dir": folder}
-    trainer = Trainer(callbacks=[*deciding, Scores()], **options, **{name: False for name in quiet})
-    trainer.fit(phase, datamodule=Views(""))
+    train_bare(phase, [*deciding, Scores()], folder)
     return points
 
 
@@ -206,7 +196,7 @@ def train_theirs(task: Task, cfg, program: str, folder: Path, threads: int, minu
             continue  # may have been stopped amid writing it
         g, _ = read_splat_ply(path)
         step, moment = int(path.stem.rpartition("_")[2]), path.stat().st_mtime
-        cpu = float(np.interp(moment, *zip(*spent, strict=True))) if spent else None
+        cpu = float(np.interp(moment, [t for t, _ in spent], [c for _, c in spent])) if spent else None
         points.append(Point(moment - began, cpu, step, score(g, task.test), len(g)))
     if not points:
         raise UserError(f"{program}: saved nothing within {minutes:g} minutes ({told[0]})")

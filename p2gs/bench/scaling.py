@@ -18,7 +18,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Sequence
+from typing import Any, Mapping, Sequence
 
 from p2gs.types import UserError
 
@@ -52,7 +52,7 @@ class Measured:
     memory_mib: float
 
 
-def plan(sizes: dict[str, Sequence[int]], base: dict[str, int]) -> list[dict[str, int]]:
+def plan(sizes: Mapping[str, Sequence[int]], base: dict[str, int]) -> list[dict[str, int]]:
     """Every setting once: each quantity over its sizes, the others at the base."""
     settings = [{**base, name: size} for name, each in sizes.items() for size in each]
     return [s for i, s in enumerate(settings) if s not in settings[:i]]
@@ -65,7 +65,7 @@ def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
     return sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / sum((a - mean_x) ** 2 for a in x)
 
 
-def exponents(rows: Sequence[Measured], sizes: dict[str, Sequence[int]], base: dict[str, int]) -> dict[str, dict]:
+def exponents(rows: Sequence[Measured], sizes: Mapping[str, Sequence[int]], base: dict[str, int]) -> dict[str, dict]:
     """By quantity: by figure, the exponents over all its sizes (``all``) and from the middle one to the largest
     (``last``). Of pixels, their number is the size, not the edge."""
     out: dict[str, dict] = {}
@@ -113,10 +113,11 @@ def measure(px: int, views: int, gaussians: int, threads: int, steps: int) -> Me
     began = now()
     prepared = TrainingViews(shots, [px])
     prepare_s = now() - began
-    options = section.config
+    options: Any = section.config
     options.levels, options.level_starts, options.steps = [px], [0.0], WARM + steps
     options.initial_gaussians = 100  # replaced
-    phase = SingleStatePhase(options, section.losses, scene, 0, prepared)
+    build: Any = SingleStatePhase
+    phase = build(options, section.losses, scene, 0, prepared)
     phase.splats = start_of(gaussians, options.sh_degree)
     step_ms = 1e3 * time_of_a_step(phase, now)
     began = now()
@@ -134,6 +135,7 @@ def photographs(px: int, count: int) -> tuple:
     from p2gs.types import Camera, View
 
     scene = bench_scene(PHOTOGRAPHED, px)
+    means, quats, scales, opacities, sh = scene.tensors()
     shots = []
     for k in range(count):
         angle = 2 * math.pi * k / count
@@ -141,10 +143,10 @@ def photographs(px: int, count: int) -> tuple:
         turned[:2, :2] = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         camera = Camera(scene.camera.viewmat @ turned, scene.camera.K, px, px)
         with torch.no_grad():
-            out = rasterize(*scene.tensors(), camera.viewmat, camera.K, px, px)
+            out = rasterize(means, quats, scales, opacities, sh, camera.viewmat, camera.K, px, px)
         colour = (out.colour / out.alpha.clamp_min(1e-3)[..., None]).clamp(0, 1)
-        pixels = (colour * 255).round().byte(), (out.alpha.clamp(0, 1) * 255).round().byte()
-        shots.append(View(f"{k:03d}", 0, "train", camera, *pixels))
+        alpha = (out.alpha.clamp(0, 1) * 255).round().byte()
+        shots.append(View(f"{k:03d}", 0, "train", camera, (colour * 255).round().byte(), alpha))
     return tuple(shots)
 
 
@@ -161,34 +163,20 @@ def start_of(count: int, sh_degree: int):
 
 def time_of_a_step(phase, now) -> float:
     """Seconds of a training step with a Trainer, the median after ``WARM`` steps."""
-    from lightning.pytorch import Trainer
-
+    from p2gs.bench.bare import train_bare
     from p2gs.callbacks.base import Callback
-    from p2gs.data.base import TwoStateData
-
-    class Views(TwoStateData):
-        """The phase has its views; this says which of them a step looks at."""
-
-        def setup(self, stage=None):
-            pass
 
     class Clock(Callback):
         changes_result = False
-        moments: list[float] = []
+
+        def __init__(self):
+            self.moments: list[float] = []
 
         def on_step(self, trainer, phase):
             self.moments.append(now())
 
     clock = Clock()
-    clock.moments = []
-    quiet = ("logger", "enable_progress_bar", "enable_model_summary", "enable_checkpointing")
-    Trainer(
-        max_steps=phase.total_steps,
-        max_epochs=-1,
-        accelerator="cpu",
-        callbacks=[clock],
-        **{name: False for name in quiet},
-    ).fit(phase, datamodule=Views(""))
+    train_bare(phase, [clock])
     counted = clock.moments[WARM - 1 :: 2]  # two steps at a time: one loss is looked at in every second
     return statistics.median(b - a for a, b in zip(counted, counted[1:], strict=False)) / 2
 
