@@ -155,9 +155,6 @@ class Phase(LightningModule, Stage):
         optimizer.zero_grad(set_to_none=True)
         total = self.total_loss(inputs)
         check_loss(self.phase_name, step, self.scalars)
-        if self.passes_over(visit):
-            optimizer.step()  # of no gradients: it counts the step
-            return
         total.backward()
         render = inputs.render
         if (
@@ -170,10 +167,6 @@ class Phase(LightningModule, Stage):
             self.splats.note_gradients(render.means2d_abs_grad, render.radii, float(render.alpha.shape[0]))
         self.constrain_gradients()
         optimizer.step()
-
-    def passes_over(self, visit: Visit) -> bool:
-        """Hook before the backward pass: whether this step can do without."""
-        return False
 
     def constrain_gradients(self) -> None:
         """Hook between backward and the optimiser's step."""

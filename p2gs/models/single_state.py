@@ -20,7 +20,6 @@ from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.health import check_gaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
 from p2gs.models.phase import Phase, PhaseConfig, register_phase
-from p2gs.models.plateau import Plateau, SkipConfig
 from p2gs.models.registered import correct_scene
 from p2gs.models.view_fit import ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
 from p2gs.ops.decay import exponential
@@ -71,8 +70,7 @@ class SingleStateConfig(ImageConfig):
     sh_degree: 0-3.  sh_every: steps until the next degree is switched on.  init: "auto" takes depth points where the
     scene has depth, "random" never does.  initial_opacity: low, so that concavities stay open until the images fill
     them.  min_visible: Gaussians of which no training view sees this share are left out at the end: nothing formed them
-    (0 = keep all).  forgive: errors of single photographs.  skip: backward passes left out of photographs at their
-    plateau.
+    (0 = keep all).  forgive: errors of single photographs.
     """
 
     steps: int = 6000
@@ -83,7 +81,6 @@ class SingleStateConfig(ImageConfig):
     sh_every: int = 500
     min_visible: float = 0.1
     forgive: ViewFitConfig = field(default_factory=ViewFitConfig)
-    skip: SkipConfig = field(default_factory=SkipConfig)
     rates: SplatRates = field(default_factory=SplatRates)
 
 
@@ -205,7 +202,6 @@ class SingleStatePhase(StatePhase):
         self.splats = Splats(isotropic_gaussians(points, colours, config.initial_opacity, config.sh_degree))
         self.shots = scene.select(state=state, split="train")
         self.errors, self.without_gains = ViewErrors(len(self.shots)), None
-        self.plateau = Plateau(config.skip, len(self.shots))
 
     def inputs(self, visit: Visit) -> LossInputs:
         step = visit.step
@@ -216,10 +212,6 @@ class SingleStatePhase(StatePhase):
         degree = min(self.config.sh_degree, step // max(self.config.sh_every, 1))
         render = self.render(g, camera, target.background, degree)
         return LossInputs(step, self.total_steps, g, render, target, camera, cache=self.loss_cache)
-
-    def passes_over(self, visit: Visit) -> bool:
-        loss = float(self.scalars.get("loss/render", self.scalars["loss/total"]))
-        return self.plateau.skips(visit.step / max(self.total_steps, 1), visit.view, loss)
 
     def constrain_gradients(self) -> None:
         config = self.config.forgive
