@@ -246,8 +246,8 @@ def markdown(ours: Sequence[Point], theirs: Sequence[Point], name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(words: list[str]) -> int:
-    """``p2gs bench peers``: the arguments behind these words; returns the exit code."""
+def options() -> argparse.ArgumentParser:
+    """The options of ``p2gs bench peers``; those of our fit come beside them."""
     parser = argparse.ArgumentParser(
         prog="p2gs bench peers",
         description="OpenSplat's CPU build, which you have built, against our single state: time to equal test PSNR.",
@@ -259,8 +259,13 @@ def main(words: list[str]) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/bench/peers"), metavar="DIR", help="default %(default)s")
     parser.add_argument("--threads", type=int, default=2, metavar="N", help="of each, one after the other (default 2)")
     parser.add_argument("--minutes", type=float, default=60.0, metavar="M", help="the program may take (default 60)")
+    return parser
+
+
+def main(words: list[str]) -> int:
+    """``p2gs bench peers``: the arguments behind these words; returns the exit code."""
     more = words[words.index("--") + 1 :] if "--" in words else []
-    args, rest = parser.parse_known_args(words[: words.index("--")] if "--" in words else words)
+    args, rest = options().parse_known_args(words[: words.index("--")] if "--" in words else words)
     program = shutil.which(args.program)
     if program is None:
         raise UserError(

@@ -232,8 +232,8 @@ def bench_scaling(out: Path, threads: int = 1, steps: int = 40, quick: bool = Fa
     return found
 
 
-def main(words: list[str]) -> int:
-    """``p2gs bench scaling``: the arguments behind these words; returns the exit code."""
+def options() -> argparse.ArgumentParser:
+    """The options of ``p2gs bench scaling``."""
     parser = argparse.ArgumentParser(
         prog="p2gs bench scaling", description="How a state's time and memory grow with pixels, views and Gaussians."
     )
@@ -243,7 +243,12 @@ def main(words: list[str]) -> int:
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="default 1, timed in CPU time")
     parser.add_argument("--steps", type=int, default=40, metavar="N", help="of a measurement (default 40)")
     parser.add_argument("--quick", action="store_true", help="small sizes, a minute: does it run?")
-    args = parser.parse_args(words)
+    return parser
+
+
+def main(words: list[str]) -> int:
+    """``p2gs bench scaling``: the arguments behind these words; returns the exit code."""
+    args = options().parse_args(words)
     if args.threads < 1 or args.steps < 4:
         raise UserError("bench scaling: expected at least 1 thread and 4 steps")
     bench_scaling(**vars(args))
