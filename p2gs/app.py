@@ -13,6 +13,7 @@ from p2gs.machine import is_of_the_machine, machine_says
 from p2gs.stopping import EXIT_CODE, Terminated
 
 COMMANDS = ("fit", "test", "predict", "export", "view", "data", "bench", "table", "version")
+TIMED = ("kernels", "scaling", "peers")  # benches that time something instead of running a matrix
 
 FIT_HELP = """\
 Any option of the config can follow as --key.of.it VALUE; null switches a loss or callback off:
@@ -223,7 +224,11 @@ def parser(prog: str = "p2gs") -> Parser:
         "--objects", nargs="+", default=["all"], metavar="NAME", help="benchmarks or object ids (default all)"
     )
 
-    bench = add("bench", "run objects x settings x seeds; bench kernels: time the rasterizers", epilog=BENCH_HELP)
+    bench = add(
+        "bench",
+        "run objects x settings x seeds; bench kernels, scaling, peers: rasterizers, growth, another program",
+        epilog=BENCH_HELP,
+    )
     bench.set_defaults(action="runs")
     bench.add_argument(
         "-c", "--config", **several, metavar="FILE", help="YAML files of benches, such as bench/paris.yaml"
@@ -265,9 +270,9 @@ def run(words: list[str], prog: str = "p2gs") -> int:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     try:
-        # has options of its own; a positional of bench would take the values of --key value
-        if words[:2] == ["bench", "kernels"]:
-            args, rest = argparse.Namespace(command="bench", action="kernels"), words[2:]
+        # these have options of their own; a positional of bench would take the values of --key value
+        if words[:1] == ["bench"] and words[1:2] and words[1] in TIMED:
+            args, rest = argparse.Namespace(command="bench", action=words[1]), words[2:]
         else:
             args, rest = top.parse_known_args(words)
         if args.command is None:

@@ -40,11 +40,13 @@ class Stopped(Exception):
 
 @dataclass(frozen=True)
 class Outcome:
-    """status: done or failed.  seconds: this sitting.  error: one sentence where it failed."""
+    """status: done or failed.  seconds: this sitting.  error: one sentence where it failed.  lost: not the run failed
+    but what carried it out."""
 
     status: str
     seconds: float
     error: Optional[str] = None
+    lost: bool = False
 
 
 def read_record(run: Path | str) -> dict:

@@ -73,6 +73,11 @@ class Display:
                 flush=True,
             )
 
+    def lost(self, cell: Cell, outcome: Outcome) -> None:
+        """The run is handed over again."""
+        if not self.terminal:
+            print(f"[{self.finished()}/{len(self.known)}] {cell.name}: lost ({outcome.error}); again", flush=True)
+
     def finished(self) -> int:
         return sum(s in ("done", "failed") for s in self.known.values())
 

@@ -50,6 +50,29 @@ def plot(path: Path, grids: Sequence[Grid]) -> bool:
     return True
 
 
+def growth(path: Path, panels: dict[str, tuple[Sequence[float], dict[str, Sequence[float]]]]) -> bool:
+    """One panel a quantity, (sizes, figure -> values): each figure over the quantity, both logarithmic and as multiples
+    of their first, beside what grows in proportion. False where matplotlib is not installed."""
+    try:
+        import matplotlib
+    except ImportError:
+        return False
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, len(panels), figsize=(4.5 * len(panels), 4), squeeze=False, layout="constrained")
+    for axis, (name, (sizes, figures)) in zip(axes.flat, panels.items(), strict=True):
+        axis.loglog(sizes, [s / sizes[0] for s in sizes], "--", color="#a4a9b3", label="in proportion")
+        for (label, values), colour in zip(figures.items(), COLOURS["ours"], strict=False):
+            axis.loglog(sizes, [v / max(values[0], 1e-9) for v in values], "o-", color=colour, label=label)
+        axis.set_xlabel(name)
+    axes[0, 0].set_ylabel("times the smallest")
+    axes[0, 0].legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return True
+
+
 def series(grid: Grid, metric: str) -> dict[tuple[str, str], dict[str, Entry]]:
     """(method, kind) -> object -> entry, of the entries that say something."""
     out: dict[tuple[str, str], dict[str, Entry]] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 from p2gs.bench.cell import Outcome
@@ -26,7 +27,7 @@ class RayExecutor:
                     address=o.address,
                     include_dashboard=False,
                     log_to_driver=False,
-                    logging_level="error",
+                    logging_level=logging.ERROR,
                     configure_logging=False,
                 )
             except Exception as err:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Iterator, Optional, Sequence
 
-from p2gs.bench.cell import PROGRAM, Outcome, note, run_cell, status
+from p2gs.bench.cell import PROGRAM, Outcome, is_done, note, run_cell, status
 from p2gs.bench.executors import executor
 from p2gs.bench.live import Display
 from p2gs.bench.plan import Bench, Cell
@@ -20,6 +20,7 @@ from p2gs.config.files import to_yaml
 from p2gs.provenance import provenance
 
 POLL = 0.2  # seconds between two looks at the jobs
+LOST_AGAIN = 2  # times that a run whose job was lost is handed over again: more is no accident of one node
 
 
 def run_bench(
@@ -40,6 +41,7 @@ def run_bench(
     show = display or Display(bench)
     with interruptible():
         jobs: dict[str, tuple[Cell, Any]] = {}
+        lost: Counter = Counter()
         place = executor(bench.options, functools.partial(run_cell, program=tuple(program))) if waiting else None
         stop = True
         try:
@@ -53,7 +55,12 @@ def run_bench(
                     for name, (cell, job) in list(jobs.items()):
                         if job.done():
                             del jobs[name]
-                            outcome = result(cell, job)
+                            lost[name] += (outcome := result(cell, job)).lost
+                            if outcome.lost and lost[name] <= LOST_AGAIN:
+                                waiting.append(cell)
+                                known[name] = "todo"
+                                show.lost(cell, outcome)
+                                continue
                             known[name] = outcome.status
                             show.ended(cell, outcome)
                     show.refresh()
@@ -66,14 +73,16 @@ def run_bench(
 
 
 def result(cell: Cell, job) -> Outcome:
-    """What became of a job; a failure of the machinery (a lost node) is the run's failure, noted in its folder."""
+    """What became of a job. A failure of the machinery (a lost node, a killed worker) is the run's failure, noted in
+    its folder, and ``lost``: unlike a run that failed by itself it may well succeed elsewhere."""
     try:
         return job.result()
     except Exception as err:
         text = " ".join(str(err).split()) or type(err).__name__
         Path(cell.run).mkdir(parents=True, exist_ok=True)
-        note(cell, status="failed", seconds=0.0, error=text[-300:])
-        return Outcome("failed", 0.0, text[-300:])
+        if not is_done(cell):
+            note(cell, status="failed", seconds=0.0, error=text[-300:])
+        return Outcome("failed", 0.0, text[-300:], lost=True)
 
 
 def save_bench(bench: Bench) -> None:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import shlex
 
 from p2gs.types import UserError
 
 
 def bench(args: argparse.Namespace, words: list[str]) -> int:
-    """Run a matrix; 1 where a run failed. ``kernels``: time the rasterizers."""
-    if args.action == "kernels":
-        from p2gs.bench.kernels import main
-
-        return main(words)
+    """Run a matrix; 1 where a run failed. Or one of the benches that time something: ``kernels`` the rasterizers,
+    ``scaling`` how a state's time and memory grow, ``peers`` another program on the same views."""
+    if args.action != "runs":
+        return importlib.import_module(f"p2gs.bench.{args.action}").main(words)
     if not args.config:
         raise UserError("bench needs a file: p2gs bench -c bench/paris.yaml --root DIR (or: p2gs bench kernels)")
     from p2gs.bench.plan import read_bench

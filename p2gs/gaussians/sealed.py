@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 from pathlib import Path
 
 SEAL = b"p2gsum1\n"
@@ -33,7 +34,10 @@ def seal(part: Path, path: Path) -> None:
 
 def check_seal(path: Path) -> None:
     """Raise Damaged unless the file ends in the checksum of what stands before it."""
-    size = path.stat().st_size
+    found = path.stat()
+    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+        raise Damaged("it is no file")  # to open a pipe is to wait for who writes into it
+    size = found.st_size
     with open(path, "rb") as file:
         if size < LENGTH:
             raise Damaged("it is cut short")

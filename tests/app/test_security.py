@@ -5,6 +5,7 @@ import ast
 import inspect
 import io
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -125,6 +126,14 @@ def test_the_checksum_tells(tmp_path, how):
 
 
 EVIL = "<script>alert(1)<x>"
+
+
+@pytest.mark.timeout(20)
+def test_a_pipe_in_place_of_a_checkpoint_is_damaged(tmp_path):
+    """To open it would wait for ever (found by make fuzz, mutant 1646 of seed 1)."""
+    os.mkfifo(tmp_path / "articulation.pt")
+    with pytest.raises(Damaged, match="it is no file"):
+        handover.load(tmp_path / "articulation.pt")
 
 
 def test_names_are_text_in_the_report(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from p2gs.app import parser
+from p2gs.bench import peers, scaling
 from p2gs.bench.plan import read_bench
 from p2gs.bench.published import table_names
 
@@ -26,10 +27,12 @@ def commands() -> list[str]:
 
 @pytest.mark.parametrize("command", commands())
 def test_commands_parse(command):
-    args, rest = parser().parse_known_args(shlex.split(command)[1:])
+    words = shlex.split(command)[1:]
+    own = {"scaling": scaling, "peers": peers}.get(words[1] if words[0] == "bench" else "")
+    args, rest = own.options().parse_known_args(words[2:]) if own else parser().parse_known_args(words)
     assert (
         not rest
-        or args.command in ("fit", "bench")
+        or (own or args.command in ("fit", "bench"))
         and rest[0].startswith("--phases.")
         or rest[0].startswith("--data.")
     )

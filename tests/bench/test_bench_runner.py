@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -209,26 +210,59 @@ def test_a_missing_library_is_told(bench_file, program, monkeypatch, name, modul
         run(read_bench([bench_file(ONE)], ["--executor", name]), program)
 
 
-def test_a_job_that_is_lost_is_a_failed_run(bench_file, program, monkeypatch):
+class Losing:
+    """An executor that loses the first ``times`` jobs of every run, after ``before(cell)``."""
+
+    slots = 1
+
+    def __init__(self, work, times, before=None):
+        self.work, self.times, self.before, self.begun = work, times, before, Counter()
+
+    def start(self, cell):
+        self.begun[cell.name] += 1
+        lost = self.begun[cell.name] <= self.times
+        if not lost or self.before is not None:
+            (self.work if not lost else self.before)(cell)
+        return Job(lost, self.work if not lost else None, cell)
+
+    def close(self, stop): ...
+
+
+class Job:
+    def __init__(self, lost, work, cell):
+        self.lost, self.work, self.cell = lost, work, cell
+
+    def done(self):
+        return True
+
+    def result(self):
+        if self.lost:
+            raise RuntimeError("the node\nis gone")
+        return self.work(self.cell)
+
+
+@pytest.mark.parametrize(
+    ("times", "counts"), [(1, {"done": 2}), (2, {"done": 2}), (3, {"failed": 2}), (99, {"failed": 2})]
+)
+def test_a_lost_job_is_handed_over_again_twice(bench_file, program, monkeypatch, times, counts):
     from p2gs.bench import runner
 
-    class Lost:
-        slots = 1
-
-        def __init__(self, options, work): ...
-
-        def start(self, cell):
-            return self
-
-        def done(self):
-            return True
-
-        def result(self):
-            raise RuntimeError("the node\nis gone")
-
-        def close(self, stop): ...
-
-    monkeypatch.setattr(runner, "executor", Lost)
+    places = []
+    monkeypatch.setattr(runner, "executor", lambda options, work: places.append(Losing(work, times)) or places[0])
     bench = read_bench([bench_file(ONE)])
-    assert run(bench, program)[0] == {"failed": 2}
-    assert read_record(bench.cells[0].run)["error"] == "the node is gone" and os.path.isdir(bench.cells[0].run)
+    found, text = run(bench, program)
+    assert found == counts and text.count("lost (the node is gone); again") == 2 * min(times, runner.LOST_AGAIN)
+    assert all(n == min(times, runner.LOST_AGAIN) + 1 for n in places[0].begun.values())
+    if counts == {"failed": 2}:
+        assert read_record(bench.cells[0].run)["error"] == "the node is gone" and os.path.isdir(bench.cells[0].run)
+    else:
+        assert all(is_done(c) and read_record(c.run)["status"] == "done" for c in bench.cells)
+
+
+def test_a_run_that_ended_though_its_job_was_lost_is_not_run_twice(bench_file, program, monkeypatch):
+    from p2gs.bench import runner
+
+    monkeypatch.setattr(runner, "executor", lambda options, work: Losing(work, 1, before=work))
+    bench = read_bench([bench_file(ONE)])
+    assert run(bench, program)[0] == {"done": 2}
+    assert len(program.calls("fit")) == 2 and all(read_record(c.run)["status"] == "done" for c in bench.cells)

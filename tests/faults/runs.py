@@ -4,6 +4,7 @@ in the end."""
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -17,10 +18,21 @@ REPO = Path(__file__).parents[2]
 OUTPUTS = ("twin.json", "splats/*.ply", "meshes/*/*.ply")
 TIMEOUT = 1800.0  # seconds for a whole fit, on a machine that does other things as well
 
+# The smoke preset with states long enough that both moving parts are found, and a search that takes two seconds.
 SMOKE = """
 include: [preset/smoke.yaml]
 data: {{format: synthetic, root: {root}, kind: demo, size: 64, train_views: 12, test_views: 2, depth: never}}
-phases: {{finish: {{exports: [urdf]}}}}
+phases:
+  single_state: {{steps: 300, initial_opacity: 0.1}}
+  discovery:
+    evidence_size: 64
+    look_steps: 4
+    reconsider: false
+    rounds: 1
+    survey: []
+    search: {{surfels: 1000, samples: 100, searches: 1, candidates: 1}}
+    coarse: {{steps: 5, levels: [64]}}
+  finish: {{exports: [urdf]}}
 callbacks: {{checkpoint: {{every: 7}}, progress: {{plain_seconds: 0.2}}}}
 """
 
@@ -133,5 +145,6 @@ def make_whole(folder: Path) -> Whole:
         ended = one.ended()
     assert ended.code == 0, ended.said
     made, lines = outputs(folder / "whole"), ended.said.count("\n")
+    assert json.loads((folder / "whole" / "twin.json").read_text())["num_parts"] > 1, "no moving part: too easy"
     assert {"twin.json", "splats/canonical.ply", "meshes/start/whole.ply", "meshes/end/whole.ply"} <= set(made)
     return Whole(config, folder / "whole", made, lines, (time.monotonic() - began) / lines)
