@@ -14,6 +14,7 @@ from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.gaussians.pose import carry, with_static
 from p2gs.losses.base import Loss
 from p2gs.models.tune import TuneConfig, tune
+from p2gs.motion.directions import shared_axes, turned_onto
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
 from p2gs.motion.refine_motions import Judge, leave_false_minima, refine, single_ways
@@ -46,11 +47,11 @@ class FinishConfig:
     export` makes them later). extend_range: joint limits go on beyond the observed motion until the part touches
     another one (half a turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians
     whose majority exceeds the rest by less are shown as such in the diagnosis (0..1). complete: meshes have guesses
-    for what no camera saw (undersides, drawers' trays, hidden middles). closed: they are watertight, by a cut; a sheet
-    that hangs in an opening gets two sides (CD static of five objects 1.23 open, 1.38 closed). whole: the mesh of the whole is its parts
-    "joined", or a surface of its own, made "separate"ly from each state's views, as PARIS, DTA and ArtGS have it.
-    cluster: for meshes a moving part keeps only its largest DBSCAN cluster of Gaussians, this the radius (input
-    units; 0 = off; ArtGS cleans real scans so, with 0.05).
+    for what no camera saw (undersides, drawers' trays, hidden middles). closed: they are watertight, by a cut; a
+    sheet that hangs in an opening gets two sides (CD static of five objects 1.23 open, 1.38 closed). whole: the
+    mesh of the whole is its parts "joined", or a surface of its own, made "separate"ly from each state's views, as
+    PARIS, DTA and ArtGS have it. cluster: for meshes a moving part keeps only its largest DBSCAN cluster of
+    Gaussians, this the radius (input units; 0 = off; ArtGS cleans real scans so, with 0.05).
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0))
@@ -176,6 +177,7 @@ def finish(
     config: FinishConfig,
     similarity: Similarity,
     losses: dict[str, Loss] | None = None,
+    discovered: PartMotions | None = None,
     *,
     seed: int,
     backend: str,
@@ -184,7 +186,9 @@ def finish(
 ) -> tuple[ArticulatedObject, list[str], FinishRecord]:
     """The twin, one line for each slot that vanished, and what was measured on the way.
 
-    views: photographs by state.  losses: those of the last training phase, for ``tune`` (None: it is left out).
+    views: photographs by state.  discovered: motions of the slots before they were learned; slides that went along one
+    direction then are laid on it again and keep it: each by itself, a shut drawer's plain front hardly tells which way
+    it went.  losses: those of the last training phase, for ``tune`` (None: it is left out).
     backend: draws the states, twin_backend: the twin in ``tune`` (None: the same).  A part's confidence is
     ``JointEvidence.confidence`` of its joint.
     """
@@ -203,7 +207,12 @@ def finish(
     transforms = learned.transforms[keep]
     types = name_types([learned.types[k - 1] for k in alive], transforms, config.prismatic_below)
     time = learned.canonical_time
+    axes = torch.full((len(types), 3), torch.nan).double()
+    if discovered is not None and len(discovered) == len(learned.types):
+        axes = shared_axes(discovered.transforms, discovered.types)[keep]
     for k, kind in enumerate(types):
+        if kind == "prismatic" and not bool(axes[k].isnan().any()):
+            transforms[k] = turned_onto(kind, transforms[k], axes[k], torch.zeros(3).double())
         rows = labels == k + 1
         start = se3.apply(se3.screw_at(transforms[k], -time), learned.gaussians.means[rows].double())
         transforms[k] = constrain(kind, transforms[k], start.mean(0))

@@ -9,7 +9,7 @@ from torch import Tensor
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.agreement import SOLID
 from p2gs.motion.discovery.hypotheses import shared_directions
-from p2gs.motion.discovery.rigid import perpendicular
+from p2gs.motion.discovery.rigid import ONE_WAY, perpendicular
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 
@@ -82,6 +82,18 @@ def _tilt(across: Tensor, offset: Tensor, rounds: int = 5) -> tuple[Tensor, Tens
 def axis_of(kind: str, T: Tensor) -> Tensor:
     """Direction [3] of a joint's axis, of its motion [4, 4]."""
     return torch.nn.functional.normalize(T[:3, 3], dim=0) if kind == "prismatic" else se3.screw_parameters(T).axis
+
+
+def shared_axes(transforms: Tensor, types: list[str]) -> Tensor:
+    """[K, 3] the direction that a slide has from the slides along the very same one (a row of drawers), NaN for all
+    other joints. transforms [K, 4, 4] of types."""
+    out = torch.full((len(types), 3), torch.nan, dtype=torch.float64)
+    slides = [k for k, kind in enumerate(types) if kind == "prismatic"]
+    ways = {k: axis_of("prismatic", transforms[k].double().cpu()) for k in slides}
+    for k in slides:
+        if any(float((ways[k] @ ways[j]).abs()) > ONE_WAY for j in slides if j != k):
+            out[k] = ways[k]
+    return out
 
 
 def turned_onto(kind: str, T: Tensor, direction: Tensor, middle: Tensor) -> Tensor:

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
-from p2gs.motion.directions import axis_of, directions_of, turned_onto
+from p2gs.motion.directions import axis_of, directions_of, shared_axes, turned_onto
+from p2gs.motion.discovery.rigid import ONE_WAY
 from p2gs.motion.refine_motions import Judge
 from p2gs.parts.settle import relabelled
 
@@ -31,27 +32,38 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
     directions = directions_of(judge.states, motions) if len(motions) else torch.zeros(0, 3)
     held = torch.full((len(motions), 3), math.nan, dtype=torch.float64)
     for k, kind in enumerate(motions.types):
+        if not bool(held[k].isnan().all()):
+            continue  # laid with another part that has the same axis
         lowest = judge(motions)[0]
         axis = axis_of(kind, motions.transforms[k])
         near = sorted((math.degrees(math.acos(min(1.0, abs(float(axis @ d))))), i) for i, d in enumerate(directions))
         if not near or not KNOWN < near[0][0] <= WITHIN:
             continue
-        axes = held.clone()
-        axes[k] = directions[near[0][1]]
-        value, laid = _best_laid(judge, motions, k, axes)
+        axes, shared = held.clone(), shared_axes(motions.transforms, motions.types)
+        parts = [k] if bool(shared[k].isnan().any()) else _along(shared, shared[k])
+        axes[parts] = directions[near[0][1]]
+        value, laid = _best_laid(judge, motions, parts, axes)
         log.append({"part": k, "type": kind, "degrees": near[0][0], "before": lowest, "after": value})
         if value <= lowest + price:
             motions, held = laid, axes
     return motions, log
 
 
-def _best_laid(judge: Judge, motions: PartMotions, k: int, axes: Tensor) -> tuple[float, PartMotions]:
-    """Energy and motions with part k's axis along ``axes[k]``: as it is turned onto it, refined, or refined with labels
-    chosen anew, whichever has the lowest energy. axes [K, 3]: directions that joints keep (NaN: free)."""
-    points = judge.states[0].gaussians.means[motions.labels[0] == k + 1].double().cpu()
-    middle = points.mean(0) if len(points) else torch.zeros(3, dtype=torch.float64)
-    T = turned_onto(motions.types[k], motions.transforms[k], axes[k], middle)
-    laid = motions.with_motion(k, motions.types[k], T)
+def _along(axes: Tensor, axis: Tensor) -> list[int]:
+    """Which of ``axes`` [K, 3] (NaN: none) is ``axis`` [3], in either sense."""
+    return ((axes @ axis).abs() > ONE_WAY).nonzero()[:, 0].tolist()
+
+
+def _best_laid(judge: Judge, motions: PartMotions, parts: list[int], axes: Tensor) -> tuple[float, PartMotions]:
+    """Energy and motions with the axes of ``parts`` along ``axes[k]``: as they are turned onto them, refined, or
+    refined with labels chosen anew, whichever has the lowest energy. axes [K, 3]: directions that joints keep (NaN:
+    free)."""
+    laid = motions
+    for k in parts:
+        points = judge.states[0].gaussians.means[motions.labels[0] == k + 1].double().cpu()
+        middle = points.mean(0) if len(points) else torch.zeros(3, dtype=torch.float64)
+        T = turned_onto(motions.types[k], motions.transforms[k], axes[k], middle)
+        laid = laid.with_motion(k, motions.types[k], T)
     tried = [laid, judge.refine(laid, axes)]
     if judge.found is not None:
         tried.append(judge.refine(relabelled(judge.found, judge.states, tried[1]), axes))

@@ -20,9 +20,9 @@ class PartMotionsConfig:
     decide; freedom_penalty: relative image loss by which a turn must win against a slide.
     same_motion: two touching parts whose motions carry them this near to each other (internal units) are tried as one.
     survey: shifts within its own surface tried for each part (internal units; [] = none).
-    part_penalty: share of the image loss that each part with an axis of its own must save, or goes, and that one which
-    is added or halved must save when parts are reconsidered. On ten objects junk saved at most 1.6 %, true parts 6 % and more, the second of
-    two stacked doors 3 %.
+    part_penalty: share of the image loss that each part with an axis of its own must save, or goes, and that one
+    which is added or halved must save when parts are reconsidered. On ten objects junk saved at most 1.6 %, true
+    parts 6 % and more, the second of two stacked doors 3 %.
     islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
     surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.
     reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched

@@ -52,6 +52,7 @@ class FinishStage(Stage):
             config,
             run.scene.similarity,
             losses,
+            motions,
             seed=run.seed,
             **backend,
         )

@@ -19,8 +19,8 @@ from p2gs.types import ArticulatedObject, Camera, Part, UserError
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """``complete``, ``closed``, ``whole`` and ``cluster`` of ``phases.finish`` (``models.finish.FinishConfig`` says what they
-    mean)."""
+    """``complete``, ``closed``, ``whole`` and ``cluster`` of ``phases.finish`` (``models.finish.FinishConfig`` says
+    what they mean)."""
 
     complete: bool = True
     closed: bool = False

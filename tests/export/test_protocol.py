@@ -87,9 +87,9 @@ def test_the_whole_of_its_own_is_written_and_scored(tmp_path):
             return SimpleNamespace(static=folder / "part_0.ply", dynamic=dynamic, whole=None)
 
     assignment = {k: k for k in range(len(twin.parts) - 1)}
-    apart = surface_scores(tmp_path, Truth, assignment, [])
+    apart, _ = surface_scores(tmp_path, Truth, assignment, [])
     (tmp_path / "config.yaml").write_text("phases: {finish: {complete: false}}")
-    together = surface_scores(tmp_path, Truth, assignment, [])
+    together, _ = surface_scores(tmp_path, Truth, assignment, [])
     assert (
         apart["static"]["value"] == together["static"]["value"]
         and apart["whole"]["value"] > 1.2 * together["whole"]["value"]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.motion.directions import axis_of, common_normal, directions_of, turned_onto
+from p2gs.motion.directions import axis_of, common_normal, directions_of, shared_axes, turned_onto
 from p2gs.motion.screw_polish import PolishConfig, allowed_step, along_axes, apply_step
 from p2gs.ops import se3
 from p2gs.parts.askew import lay_axes
@@ -153,3 +153,17 @@ def test_an_axis_askew_is_laid_where_that_costs_next_to_nothing(degrees, slope, 
     assert lay_axes(judge, motions, 0.0) == (motions, [])  # switched off
     judge.config = PolishConfig(steps=0)
     assert lay_axes(judge, motions, 0.01) == (motions, [])  # screws stay as they were learned
+
+
+def slide(x, y, z):
+    T = torch.eye(4).double()
+    T[:3, 3] = torch.tensor([x, y, z])
+    return T
+
+
+def test_slides_along_the_very_same_direction_share_it_and_others_are_free():
+    T = torch.stack([slide(0.2, 0, 0), slide(-0.3, 0, 0), slide(0.1, 0.0005, 0), slide(0, 0, 0.2)])
+    axes = shared_axes(T, ["prismatic"] * 4)
+    assert axes[0].abs().tolist() == axes[1].abs().tolist() == [1, 0, 0]
+    assert bool(axes[2:].isnan().all())  # 0.3 degrees off was fitted by itself, and one alone shares nothing
+    assert bool(shared_axes(T[:2], ["prismatic", "revolute"]).isnan().all())
