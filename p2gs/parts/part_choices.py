@@ -29,7 +29,8 @@ def simplify(judge: Judge, motions: PartMotions, same_motion: float, log: list[d
                 continue
             tried.add(change)
             value, lower = judge(reduced)
-            if value <= lowest or (lonely(motions, reduced) and cost > lower * (1 - judge.further)):
+            junk = change[0] == "drop" and lonely(motions, reduced) and cost > lower * (1 - judge.further)
+            if value <= lowest or junk:
                 break
         else:
             return motions
