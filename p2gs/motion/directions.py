@@ -3,6 +3,8 @@ and most joints lie along one of them."""
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -13,19 +15,29 @@ from p2gs.motion.discovery.rigid import ONE_WAY, perpendicular
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 
+WITHIN = 15.0  # degrees within which a direction is one that is known, or an axis is meant to lie along it
 FACING = 0.99  # cosine between a point's normal and the facing of the planes that it is taken for a point of: 8 degrees
 FEWEST = 20  # points of a plane
 ROUNDS = 3  # of planes found and fitted
 
 
 def directions_of(states: list[StateGaussians], motions: PartMotions) -> Tensor:
-    """[D, 3] directions (float64) of what turned in neither state: ``shared_directions`` of the normals of static and
-    slid Gaussians, each fitted to the planes that face it (``common_normal``)."""
-    turned = torch.tensor([False, *(kind == "revolute" for kind in motions.types)])
+    """[D, 3] directions (float64) that the static Gaussians of both states face, and those besides (farther than
+    ``WITHIN`` from them) that what slid faces, too: it did not turn, but a shut drawer's surfaces are worse."""
+    slid = torch.tensor([True, *(kind == "prismatic" for kind in motions.types)])
+    still = _faced(states, [of.cpu() == 0 for of in motions.labels])
+    more = _faced(states, [slid[of.cpu()] for of in motions.labels]) if slid[1:].any() else still[:0]
+    apart = math.cos(math.radians(WITHIN))
+    return torch.cat([still, more[((more @ still.T).abs() < apart).all(1)]])
+
+
+def _faced(states: list[StateGaussians], chosen: list[Tensor]) -> Tensor:
+    """[D, 3]: ``shared_directions`` of the normals of the solid Gaussians ``chosen`` [N] bool of each state, each
+    fitted to the planes that face it (``common_normal``)."""
     points, normals = [], []
-    for state, of in zip(states, motions.labels, strict=True):
+    for state, of in zip(states, chosen, strict=True):
         g = state.gaussians.detach()
-        still = ~turned[of.cpu()] & (torch.sigmoid(g.opacity_logits).cpu() > SOLID)
+        still = of & (torch.sigmoid(g.opacity_logits).cpu() > SOLID)
         R = so3.quat_to_matrix(so3.quat_normalize(g.quats.cpu()[still]))
         shortest = g.log_scales.cpu()[still].argmin(1)
         normals.append(R.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0])

@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
-from p2gs.motion.directions import axis_of, directions_of, shared_axes, turned_onto
+from p2gs.motion.directions import WITHIN, axis_of, directions_of, shared_axes, turned_onto
 from p2gs.motion.discovery.rigid import ONE_WAY
 from p2gs.motion.refine_motions import Judge
 from p2gs.parts.settle import relabelled
 
-WITHIN = 15.0  # degrees about a direction in which an axis is tried on it: as where parts are fitted (``snapped``)
 KNOWN = 1.0  # degrees to which directions are known; an axis that is nearer keeps what photographs say
 
 
