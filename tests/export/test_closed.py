@@ -58,7 +58,7 @@ def test_a_block_is_closed_by_its_guessed_underside():
     assert solid.volume == pytest.approx(0.48, rel=0.06)  # nobody saw its inside: it is filled
     down = solid.face_normals[:, 2] < -0.8
     guessed = solid.area_faces[mesh.guessed]
-    assert guessed.sum() == pytest.approx(0.8, rel=0.1)
+    assert 0.75 < guessed.sum() < 0.8 + 3.6 * VOXEL  # the underside, and at most a voxel's rim around it
     assert solid.area_faces[down & ~mesh.guessed].sum() < 0.08
     shown = sample_surface(mesh.only(~mesh.guessed), 3000)  # rims, where depth has an edge, reach out by a voxel or two
     assert np.quantile(np.abs(to_boxes(shown, [((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))])), 0.9) < 0.5 * VOXEL
