@@ -36,10 +36,12 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
         lowest = judge(motions)[0]
         axis = axis_of(kind, motions.transforms[k])
         near = sorted((math.degrees(math.acos(min(1.0, abs(float(axis @ d))))), i) for i, d in enumerate(directions))
-        if not near or not KNOWN < near[0][0] <= WITHIN:
-            continue
-        axes, shared = held.clone(), shared_axes(motions.transforms, motions.types)
+        shared = shared_axes(motions.transforms, motions.types)
         parts = [k] if bool(shared[k].isnan().any()) else _along(shared, shared[k])
+        # an axis that several share was laid on a direction of the search's, coarser than these, and no photograph moved it
+        if not near or not (KNOWN if len(parts) == 1 else 0.0) < near[0][0] <= WITHIN:
+            continue
+        axes = held.clone()
         axes[parts] = directions[near[0][1]]
         value, laid = _best_laid(judge, motions, parts, axes)
         log.append({"part": k, "type": kind, "degrees": near[0][0], "before": lowest, "after": value})
