@@ -38,7 +38,7 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
         near = sorted((math.degrees(math.acos(min(1.0, abs(float(axis @ d))))), i) for i, d in enumerate(directions))
         shared = shared_axes(motions.transforms, motions.types)
         parts = [k] if bool(shared[k].isnan().any()) else _along(shared, shared[k])
-        # an axis that several share was laid on a direction of the search's, coarser than these, and no photograph moved it
+        # an axis that several share is one of the search's directions, coarser than these, and no photograph moved it
         if not near or not (KNOWN if len(parts) == 1 else 0.0) < near[0][0] <= WITHIN:
             continue
         axes = held.clone()
