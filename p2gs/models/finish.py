@@ -14,14 +14,14 @@ from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.gaussians.pose import carry, with_static
 from p2gs.losses.base import Loss
 from p2gs.models.tune import TuneConfig, tune
-from p2gs.motion.directions import shared_axes, turned_onto
+from p2gs.motion.directions import shared_axes
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
 from p2gs.motion.refine_motions import Judge, leave_false_minima, refine, single_ways
 from p2gs.motion.screw_polish import PolishConfig, photometric_cost
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
-from p2gs.parts.askew import lay_axes
+from p2gs.parts.askew import keep_shared, lay_axes
 from p2gs.parts.islands import settle_twin_islands
 from p2gs.surface.contents import in_trays
 from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
@@ -186,9 +186,9 @@ def finish(
 ) -> tuple[ArticulatedObject, list[str], FinishRecord]:
     """The twin, one line for each slot that vanished, and what was measured on the way.
 
-    views: photographs by state.  discovered: motions of the slots before they were learned; slides that went along one
-    direction then are laid on it again and keep it: each by itself, a shut drawer's plain front hardly tells which way
-    it went.  losses: those of the last training phase, for ``tune`` (None: it is left out).
+    views: photographs by state. discovered: motions of the slots before they were learned; slides that went along one
+    direction then may leave it by a degree (``keep_shared``). losses: those of the last training phase, for ``tune``
+    (None: it is left out).
     backend: draws the states, twin_backend: the twin in ``tune`` (None: the same).  A part's confidence is
     ``JointEvidence.confidence`` of its joint.
     """
@@ -211,8 +211,6 @@ def finish(
     if discovered is not None and len(discovered) == len(learned.types):
         axes = shared_axes(discovered.transforms, discovered.types)[keep]
     for k, kind in enumerate(types):
-        if kind == "prismatic" and not bool(axes[k].isnan().any()):
-            transforms[k] = turned_onto(kind, transforms[k], axes[k], torch.zeros(3).double())
         rows = labels == k + 1
         start = se3.apply(se3.screw_at(transforms[k], -time), learned.gaussians.means[rows].double())
         transforms[k] = constrain(kind, transforms[k], start.mean(0))
@@ -232,6 +230,7 @@ def finish(
         judge = Judge(None, states, views, config.polish, stacks, **options)
         refined, _ = leave_false_minima(judge, refined, config.survey)
         refined, record.laid = lay_axes(judge, refined, config.askew)
+        refined = keep_shared(judge, refined, axes)
         transforms = refined.transforms
         record.after = transforms
         record.polish = single_ways(states, refined, views, config.polish, stacks, **options)

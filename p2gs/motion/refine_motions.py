@@ -13,7 +13,6 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.agreement import ShownPixels, kept_and_shown
-from p2gs.motion.directions import shared_axes
 from p2gs.motion.discovery import Discovery, surface_energy
 from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.screw_polish import PolishConfig, Side, allowed_step, apply_step, photometric_cost, polish
@@ -63,12 +62,9 @@ def refine(
     axes: Tensor | None = None,
     device="cpu",
 ) -> PartMotions:
-    """Photometric refinement of all motions, both directions at once. axes: as in ``polish``; slides along the very
-    same direction keep it in any case."""
+    """Photometric refinement of all motions, both directions at once. axes: as in ``polish``."""
     if config.steps <= 0 or len(motions) == 0:
         return motions
-    shared = shared_axes(motions.transforms, motions.types)
-    axes = shared if axes is None else torch.where(axes.isnan(), shared, axes)
     sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
     options = {"seed": seed, "axes": axes, "backend": backend, "device": device}
     result, _ = polish(sides, motions.transforms, motions.types, config, **options)
@@ -94,9 +90,8 @@ def single_ways(
         return {}
     short = replace(config, steps=max(config.steps // 3, 1), rate=config.rate / 2)
     sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
-    axes = shared_axes(motions.transforms, motions.types)
     options = {"seed": seed, "backend": backend, "device": device}
-    found = [polish([side], motions.transforms, motions.types, short, axes=axes, **options) for side in sides]
+    found = [polish([side], motions.transforms, motions.types, short, **options) for side in sides]
     return {name: T for name, (T, _) in zip(("forward", "backward"), found, strict=True)}
 
 

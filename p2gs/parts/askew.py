@@ -38,8 +38,7 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
         near = sorted((math.degrees(math.acos(min(1.0, abs(float(axis @ d))))), i) for i, d in enumerate(directions))
         shared = shared_axes(motions.transforms, motions.types)
         parts = [k] if bool(shared[k].isnan().any()) else _along(shared, shared[k])
-        # an axis that several share is one of the search's directions, coarser than these, and no photograph moved it
-        if not near or not (KNOWN if len(parts) == 1 else 0.0) < near[0][0] <= WITHIN:
+        if not near or not KNOWN < near[0][0] <= WITHIN:
             continue
         axes = held.clone()
         axes[parts] = directions[near[0][1]]
@@ -48,6 +47,20 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
         if value <= lowest + price:
             motions, held = laid, axes
     return motions, log
+
+
+def keep_shared(judge: Judge, motions: PartMotions, axes: Tensor) -> PartMotions:
+    """The motions with each slide that photographs took farther than ``KNOWN`` from the direction ``axes`` [K, 3] that
+    it shared with others (NaN: none) laid on it again, and refined with it held. Each by itself, a shut drawer's plain
+    front hardly tells which way it went."""
+    held, laid = torch.full_like(axes, math.nan), motions
+    for k in (~axes.isnan().any(1)).nonzero()[:, 0].tolist():
+        T = motions.transforms[k]
+        off = float((axis_of("prismatic", T).double() @ axes[k]).abs()) < math.cos(math.radians(KNOWN))
+        if motions.types[k] == "prismatic" and off:
+            held[k] = axes[k]
+            laid = laid.with_motion(k, "prismatic", turned_onto("prismatic", T, axes[k], torch.zeros(3).double()))
+    return judge.refine(laid, held) if laid is not motions else motions
 
 
 def _along(axes: Tensor, axis: Tensor) -> list[int]:

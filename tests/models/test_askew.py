@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.directions import axis_of, common_normal, directions_of, shared_axes, turned_onto
 from p2gs.motion.screw_polish import PolishConfig, allowed_step, along_axes, apply_step
 from p2gs.ops import se3
-from p2gs.parts.askew import lay_axes
+from p2gs.parts.askew import keep_shared, lay_axes
 from p2gs.types import GaussianTensors
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -167,3 +168,17 @@ def test_slides_along_the_very_same_direction_share_it_and_others_are_free():
     assert axes[0].abs().tolist() == axes[1].abs().tolist() == [1, 0, 0]
     assert bool(axes[2:].isnan().all())  # 0.3 degrees off was fitted by itself, and one alone shares nothing
     assert bool(shared_axes(T[:2], ["prismatic", "revolute"]).isnan().all())
+
+
+def test_a_shared_direction_is_kept_where_photographs_leave_it_by_more_than_a_degree():
+    T = torch.stack([slide(0.2, 0, 0), slide(0.3, 0.003, 0), slide(0.3, 0.03, 0), slide(0.1, 0.1, 0)])
+    motions = PartMotions(["prismatic"] * 4, T, torch.ones(4), [], [])
+    axes = torch.tensor([[1.0, 0, 0]]).double().repeat(4, 1)
+    axes[3] = math.nan
+    held = []
+    judge = SimpleNamespace(refine=lambda m, a: held.append(a) or m)
+    kept = keep_shared(judge, motions, axes)
+    assert torch.equal(kept.transforms[[0, 1, 3]], T[[0, 1, 3]])
+    assert kept.transforms[2, :3, 3].tolist() == pytest.approx([0.3, 0, 0])
+    assert held[0][2].tolist() == [1, 0, 0] and bool(held[0][[0, 1, 3]].isnan().all())
+    assert keep_shared(judge, kept, axes) is kept and len(held) == 1
