@@ -35,7 +35,8 @@ def test_scaling_runs_and_writes(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(scaling, "QUICK_BASE", {"px": 48, "views": 2, "gaussians": 300})
     assert main(["bench", "scaling", "--quick", "--steps", "4", "--out", str(tmp_path)]) == 0
     told = json.loads((tmp_path / "scaling.json").read_text())
-    assert len(told["rows"]) == 3 and all(r["step_ms"] > 0 and r["memory_mib"] > 0 for r in told["rows"])
+    assert len(told["rows"]) == 3 and all(r["step_ms"] > 0 for r in told["rows"])
+    assert all(r["memory_mib"] >= 0 for r in told["rows"])  # so small a state may fit in what loading took
     assert (tmp_path / "scaling.md").read_text() in capsys.readouterr().out and (tmp_path / "scaling.png").is_file()
 
 
