@@ -27,7 +27,6 @@ GROWTH = {"px": (100, 400, 800), "views": (16, 64, 200), "gaussians": (20_000, 1
 QUICK = {"px": (50, 100, 200), "views": (4, 8, 16), "gaussians": (1_000, 2_000, 4_000)}
 QUICK_BASE = {"px": 100, "views": 8, "gaussians": 2_000}
 PHOTOGRAPHED = 20_000  # Gaussians that the photographs are drawn from
-EVIDENCE_SIZE = 200  # pixels of discovery's depth maps in preset/cpu.yaml
 WARM = 5  # steps that are not counted: caches and the allocator fill
 FIGURES = {
     "step_ms": "ms a step",
@@ -70,8 +69,7 @@ def exponents(rows: Sequence[Measured], sizes: Mapping[str, Sequence[int]], base
     (``last``). Of pixels, their number is the size, not the edge."""
     out: dict[str, dict] = {}
     for name, each in sizes.items():
-        found = [next(r for r in rows if is_of(r, {**base, name: size})) for size in each]
-        counts = [size**2 if name == "px" else size for size in each]
+        counts, found = series(rows, name, each, base)
         out[name] = {}
         for figure in FIGURES:
             values = [getattr(r, figure) for r in found]
@@ -79,8 +77,13 @@ def exponents(rows: Sequence[Measured], sizes: Mapping[str, Sequence[int]], base
     return out
 
 
-def is_of(row: Measured, setting: dict[str, int]) -> bool:
-    return all(getattr(row, name) == value for name, value in setting.items())
+def series(
+    rows: Sequence[Measured], name: str, each: Sequence[int], base: dict[str, int]
+) -> tuple[list[int], list[Measured]]:
+    """How much there is of a quantity over its sizes, of pixels their number, and what was measured then."""
+    settings = [{**base, name: size} for size in each]
+    found = [next(r for r in rows if all(getattr(r, n) == v for n, v in s.items())) for s in settings]
+    return [size**2 if name == "px" else size for size in each], found
 
 
 # -- one measurement, in a process of its own -------------------------------------------------------------------------
@@ -104,7 +107,8 @@ def measure(px: int, views: int, gaussians: int, threads: int, steps: int) -> Me
     from p2gs.visibility.evidence import gather_evidence
 
     torch.set_num_threads(threads)
-    section = load_config(["preset/cpu.yaml"]).phases["single_state"]
+    phases = load_config(["preset/cpu.yaml"]).phases
+    section, discovery = phases["single_state"], phases["discovery"].config
     now = time.process_time if threads == 1 else time.perf_counter
     before = peak_mib()
     shots = photographs(px, views)
@@ -121,7 +125,7 @@ def measure(px: int, views: int, gaussians: int, threads: int, steps: int) -> Me
     phase.splats = start_of(gaussians, options.sh_degree)
     step_ms = 1e3 * time_of_a_step(phase, now)
     began = now()
-    gather_evidence(phase.splats.tensors().detach(), shots, EVIDENCE_SIZE, 0.5)
+    gather_evidence(phase.splats.tensors().detach(), shots, discovery.evidence_size, discovery.min_opacity)
     depth_s = now() - began
     return Measured(px, views, gaussians, threads, step_ms, prepare_s, depth_s, peak_mib() - before)
 
@@ -223,8 +227,7 @@ def bench_scaling(out: Path, threads: int = 1, steps: int = 40, quick: bool = Fa
     (out / "scaling.json").write_text(json.dumps({"rows": [asdict(r) for r in rows], "exponents": found}, indent=1))
     panels = {}
     for name, each in sizes.items():
-        chosen = [next(r for r in rows if is_of(r, {**base, name: size})) for size in each]
-        at = [size**2 if name == "px" else size for size in each]
+        at, chosen = series(rows, name, each, base)
         label = "pixels" if name == "px" else name
         panels[label] = at, {text: [getattr(r, f) for r in chosen] for f, text in FIGURES.items()}
     plots.growth(out / "scaling.png", panels)

@@ -102,10 +102,9 @@ def load_asset(
     scale: metres per input unit.  up: axis of the target that points up; the input's is z.  origin: ``keep`` the
     input's, ``center`` of the object's box, or the middle of its ``bottom``.  solid: with collision pieces and inertia;
     without, for looking at only, it takes no time.  A moving part without a surface is left out, a base without one is
-    bare.  extend_range: joint limits beyond the observed motion, until pieces
-    touch (only where solid).  texture: makes one of a part's id and mesh (``texture.Baker``).  splats: with each part's
-    Gaussians.  Raises UserError for other values, a run without a twin or
-    one of which no part has a surface.
+    bare.  extend_range: joint limits beyond the observed motion, until pieces touch (only where solid).  texture: makes
+    one of a part's id and mesh (``texture.Baker``).  splats: with each part's Gaussians.  Raises UserError for other
+    values, a run without a twin or one of which no part has a surface.
     """
     if up not in UPS:
         raise UserError(f"--up is '{up}', expected one of {', '.join(UPS)}")

@@ -11,7 +11,7 @@ from torch import Tensor
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.agreement import SOLID
 from p2gs.motion.discovery.hypotheses import shared_directions
-from p2gs.motion.discovery.rigid import ONE_WAY, perpendicular
+from p2gs.motion.discovery.rigid import one_way, perpendicular
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 
@@ -101,9 +101,11 @@ def shared_axes(transforms: Tensor, types: list[str]) -> Tensor:
     other joints. transforms [K, 4, 4] of types."""
     out = torch.full((len(types), 3), torch.nan, dtype=torch.float64)
     slides = [k for k, kind in enumerate(types) if kind == "prismatic"]
-    ways = {k: axis_of("prismatic", transforms[k].double().cpu()) for k in slides}
+    ways = out.clone()
     for k in slides:
-        if any(float((ways[k] @ ways[j]).abs()) > ONE_WAY for j in slides if j != k):
+        ways[k] = axis_of("prismatic", transforms[k].double().cpu())
+    for k in slides:
+        if int(one_way(ways, ways[k]).sum()) > 1:
             out[k] = ways[k]
     return out
 

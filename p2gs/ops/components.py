@@ -8,6 +8,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
+# points nearer than this, in spacings, lie on one surface: two, and the spacing is the median of an uneven sample
+TOUCH = 2.5
+
 
 def components(points: Tensor, reach: float) -> np.ndarray:
     """Connected component [N] of points [N, 3], joined where they are nearer than ``reach``."""

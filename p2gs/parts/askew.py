@@ -11,7 +11,7 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.directions import WITHIN, axis_of, directions_of, shared_axes, turned_onto
-from p2gs.motion.discovery.rigid import ONE_WAY
+from p2gs.motion.discovery.rigid import one_way
 from p2gs.motion.refine_motions import Judge
 from p2gs.parts.settle import relabelled
 
@@ -37,7 +37,7 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
         axis = axis_of(kind, motions.transforms[k])
         near = sorted((math.degrees(math.acos(min(1.0, abs(float(axis @ d))))), i) for i, d in enumerate(directions))
         shared = shared_axes(motions.transforms, motions.types)
-        parts = [k] if bool(shared[k].isnan().any()) else _along(shared, shared[k])
+        parts = [k] if bool(shared[k].isnan().any()) else one_way(shared, shared[k]).nonzero()[:, 0].tolist()
         if not near or not KNOWN < near[0][0] <= WITHIN:
             continue
         axes = held.clone()
@@ -61,11 +61,6 @@ def keep_shared(judge: Judge, motions: PartMotions, axes: Tensor) -> PartMotions
             held[k] = axes[k]
             laid = laid.with_motion(k, "prismatic", turned_onto("prismatic", T, axes[k], torch.zeros(3).double()))
     return judge.refine(laid, held) if laid is not motions else motions
-
-
-def _along(axes: Tensor, axis: Tensor) -> list[int]:
-    """Which of ``axes`` [K, 3] (NaN: none) is ``axis`` [3], in either sense."""
-    return ((axes @ axis).abs() > ONE_WAY).nonzero()[:, 0].tolist()
 
 
 def _best_laid(judge: Judge, motions: PartMotions, parts: list[int], axes: Tensor) -> tuple[float, PartMotions]:

@@ -16,11 +16,9 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.ops import se3
-from p2gs.ops.components import components
+from p2gs.ops.components import TOUCH, components
 from p2gs.visibility.depth_stack import DepthStack, classify
 
-# points nearer than this, in spacings, lie on one surface: two, and the spacing is the median of an uneven sample
-TOUCH = 2.5
 FEWEST = 30  # points of a body in each state: a plate of 5 x 6 of them
 BRIDGES = 256  # lines between two pieces that are tried, from the shortest up
 STOPS = 9  # points looked at on each line

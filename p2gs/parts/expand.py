@@ -20,12 +20,12 @@ from p2gs.motion.refine_motions import Judge
 
 def expand(judge: Judge, motions: PartMotions) -> tuple[PartMotions, list[dict]]:
     """Motions and labels of lowest energy, after parts took the static surface or the whole object; what was taken."""
-    lowest, _ = judge(motions)
-    best, taken = motions, []
+    first, _ = judge(motions)
+    best, lowest, taken = motions, first, []
     for how, part, tried in expansions(motions):
         value, _ = judge(tried)
         if value < lowest:
-            taken = [{"change": how, "part": part, "energy": value - judge(motions)[0]}]
+            taken = [{"change": how, "part": part, "energy": value - first}]
             best, lowest = tried, value
     return best, taken
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from one_stage import REPO
+from one_stage import REPO, SMALL_PHASES
 
 from p2gs.app import run as p2gs
 from p2gs.data.generated.articulated import SyntheticObject, SyntheticPart, prismatic
@@ -19,17 +19,7 @@ include: [{repo}/configs/preset/smoke.yaml]
 data: {{format: artgs, root: {root}, depth: never}}
 num_parts: 2
 phases:
-  single_state:
-    steps: 150
-    initial_gaussians: 1500
-    levels: [32, 64]
-    level_starts: [0.0, 0.3]
-    callbacks: {{densify: {{budget: 2000, every: 20}}}}
-  discovery: {{evidence_size: 64, candidates: 1, search: {{surfels: 4000, samples: 200}},
-    coarse: {{steps: 10, levels: [64], level_starts: [0.0]}}}}
-  canonical_fusion: {{steps: 12, levels: [64], level_starts: [0.0], canonical: {{match_size: 300}}}}
-  articulation: {{steps: 12, levels: [64], level_starts: [0.0], refresh: 4}}
-  finish: {{polish: {{steps: 8, levels: [64], level_starts: [0.0]}}, exports: [all]}}
+{phases}  finish: {{polish: {{steps: 8, levels: [64], level_starts: [0.0]}}, exports: [all]}}
 """
 
 
@@ -47,7 +37,7 @@ def test_an_object_of_which_nothing_stands_still(tmp_path, capsys):
     parts = (SyntheticPart("base", ()), SyntheticPart("box", tuple(pieces), prismatic((1, 0, 0), (0, 0, 0), 0.0, 0.5)))
     thing, run = SyntheticObject("thing", parts).fitted(), tmp_path / "run"
     write_scene(thing, tmp_path / "scene", size=64, train_views=12, test_views=2, depth=False)
-    (tmp_path / "small.yaml").write_text(SMALL.format(repo=REPO, root=tmp_path / "scene"))
+    (tmp_path / "small.yaml").write_text(SMALL.format(repo=REPO, phases=SMALL_PHASES, root=tmp_path / "scene"))
     fit = ["fit", "-c", str(tmp_path / "small.yaml"), "--run", str(run)]
     for stage in ("single_state", "registration", "discovery"):
         assert p2gs([*fit, "--only", stage]) == 0

@@ -10,27 +10,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from one_stage import REPO, SMALL_PHASES
 
 from p2gs.gaussians import handover
-
-REPO = Path(__file__).parents[2]
 
 SMALL = """
 include: [{repo}/configs/preset/smoke.yaml]
 data: {{format: synthetic, root: {root}, kind: demo, size: 64, train_views: 12, test_views: 2, depth: never}}
 num_parts: 3
 phases:
-  single_state:
-    steps: 150
-    initial_gaussians: 1500
-    levels: [32, 64]
-    level_starts: [0.0, 0.3]
-    callbacks: {{densify: {{budget: 2000, every: 20}}}}
-  discovery: {{evidence_size: 64, candidates: 1, search: {{surfels: 4000, samples: 200}},
-    coarse: {{steps: 10, levels: [64], level_starts: [0.0]}}}}
-  canonical_fusion: {{steps: 12, levels: [64], level_starts: [0.0], canonical: {{match_size: 300}}}}
-  articulation: {{steps: 12, levels: [64], level_starts: [0.0], refresh: 4}}
-  finish: {{polish: {{steps: 8, levels: [64], level_starts: [0.0]}}}}
+{phases}  finish: {{polish: {{steps: 8, levels: [64], level_starts: [0.0]}}}}
 callbacks:
   checkpoint: {{every: 4}}
 """
@@ -53,7 +42,7 @@ def environment() -> dict:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("pipeline")
-    (path / "small.yaml").write_text(SMALL.format(repo=REPO, root=path / "scene"))
+    (path / "small.yaml").write_text(SMALL.format(repo=REPO, phases=SMALL_PHASES, root=path / "scene"))
     done = fit(path, "--run", str(path / "whole"))
     assert done.returncode == 0, done.stderr
     return path

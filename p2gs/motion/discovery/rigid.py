@@ -212,8 +212,13 @@ def without(motions: Motions, k: int) -> Motions:
 
 def axes_used(motions: Motions) -> int:
     """How many axes the motions have: one for each turn, one for each direction that slides share (``ONE_WAY``)."""
-    ways: list[Tensor] = []
+    ways = motions.axis[:0]
     for way in motions.axis[~motions.turn]:
-        if not any(float((way @ other).abs()) > ONE_WAY for other in ways):
-            ways.append(way)
+        if not bool(one_way(ways, way).any()):
+            ways = torch.cat([ways, way[None]])
     return int(motions.turn.sum()) + len(ways)
+
+
+def one_way(axes: Tensor, axis: Tensor) -> Tensor:
+    """[K] bool: which of ``axes`` [K, 3] (NaN: none) are the very direction ``axis`` [3], in either sense."""
+    return (axes @ axis).abs() > ONE_WAY

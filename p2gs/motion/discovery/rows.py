@@ -14,10 +14,9 @@ from p2gs.motion.discovery.amounts import amounts_of
 from p2gs.motion.discovery.labels import Labelling
 from p2gs.motion.discovery.problem import Problem
 from p2gs.motion.discovery.rigid import Motions
-from p2gs.ops.components import components
+from p2gs.ops.components import TOUCH, components
 
 FACING = 0.95  # cosine: within 18 degrees a surface stands across the direction
-TOUCH = 2.5  # spacings between neighbours on one surface, as in parts/bodies.py
 
 
 def rows(problem: Problem, labelling: Labelling, motions: Motions, axes: Tensor) -> list[Motions]:
