@@ -12,7 +12,7 @@ from collections import Counter
 from functools import partial
 
 import pytest
-from runs import Fit, fit, make_whole
+from whole_runs import Fit, fit, make_whole
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(0)]
 KILLS = int(os.environ.get("P2GS_KILLS", "100"))

@@ -11,13 +11,13 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from whole_runs import REPO
 
 from p2gs.bench.cell import PROGRAM, is_done, read_record
 from p2gs.bench.plan import read_bench
 from p2gs.bench.report import write_tables
 from p2gs.bench.runner import run_bench
 from p2gs.data.generated.generate import synthesize
-from runs import REPO
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(0)]
 RUNS = int(os.environ.get("P2GS_RUNS_OF_A_BENCH", "100"))

@@ -4,10 +4,10 @@ that fill a twentieth of a picture among them, with 64 pixels and with 32. ``mak
 import json
 
 import pytest
+from whole_runs import fit
 
 from p2gs.data.generated.furniture import KINDS
 from p2gs.data.generated.generate import synthesize
-from runs import fit
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(0)]
 
