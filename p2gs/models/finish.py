@@ -17,7 +17,7 @@ from p2gs.models.tune import TuneConfig, tune
 from p2gs.motion.directions import shared_axes
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
-from p2gs.motion.refine_motions import Judge, leave_false_minima, refine, single_ways
+from p2gs.motion.refine_motions import Judge, leave_false_minima, single_ways
 from p2gs.motion.screw_polish import PolishConfig, photometric_cost
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
@@ -226,8 +226,8 @@ def finish(
     options["seed"] = seed
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
-        refined = refine(states, motions, views, config.polish, stacks, **options)
         judge = Judge(None, states, views, config.polish, stacks, **options)
+        refined = judge.no_worse(motions, judge.refine(motions))
         refined, _ = leave_false_minima(judge, refined, config.survey)
         refined, record.laid = lay_axes(judge, refined, config.askew)
         refined = keep_shared(judge, refined, axes)

@@ -21,7 +21,7 @@ from p2gs.data.views import TargetImage, TrainingViews
 from p2gs.gaussians.handover import Registration, StateGaussians
 from p2gs.models.registered import REGISTRATION, dimmed, register_state, register_views, write_registration
 from p2gs.models.stage import Stage, register_phase
-from p2gs.models.trial import held_out, trial
+from p2gs.models.trial import Trial, held_out, trial
 from p2gs.motion.photo_fit import COLOUR, STRUCTURE, PhotoSide, compare, fit_photographs, photograph, unmoved
 from p2gs.motion.surface_fit import fit_surfaces
 from p2gs.ops import se3, so3
@@ -30,6 +30,7 @@ from p2gs.visibility.depth_stack import DepthStack, StateEvidence
 from p2gs.visibility.evidence import evidence_of
 from p2gs.visibility.surfels import build_surfels
 
+NOTHING = Trial(0.0, 0.0, 0.0, 0.0, 0)  # nothing was tried
 NOISE = 2e-4  # least noise of surfels, of the box's diagonal: discovery's
 
 
@@ -86,14 +87,18 @@ def align_states(
     held = [held_out(len(views[s])) for s in (1, 0)]
     fitted, judged = [h[0] for h in held], [h[1] for h in held]
     gain = pair.end_gain(T, fitted[0], config.levels[0]) if config.gain == "auto" else dark
+    moved = NOTHING
     for size in config.levels if config.motion == "auto" else ():
         T = fit_photographs(pair.sides(gain), T, fitted, config.steps, size, tolerance, backend=backend)
-    shots = pair.judges(judged, config.levels[-1], T)
-    moved = trial(pair.errors(shots, still, gain, STRUCTURE), pair.errors(shots, T, gain, STRUCTURE))
+        shots = pair.judges(judged, size, T)
+        moved = trial(pair.errors(shots, still, gain, STRUCTURE), pair.errors(shots, T, gain, STRUCTURE))
+        if not moved.passed(config.least):
+            break  # states that lie on one another need no finer look
     points = surfels[1].points.double()
     shift = float((se3.apply(T, points) - points).norm(dim=1).square().mean().sqrt()) / diagonal
     apply_motion = config.motion == "auto" and shift > config.least_shift and moved.passed(config.least)
     best = T if apply_motion else still
+    shots = pair.judges(judged, config.levels[-1], best)
     dimmer = trial(pair.errors(shots, best, dark, COLOUR), pair.errors(shots, best, gain, COLOUR))
     apply_gain = config.gain == "auto" and dimmer.passed(config.least)
     angle = float(torch.rad2deg(so3.rotation_angle(T[:3, :3])))
@@ -192,4 +197,4 @@ class RegistrationStage(Stage):
         """The states in the start's frame; so are scene and views from here on."""
         write_registration(run.run_dir / REGISTRATION, value, states, run.scene_as_read)
         run.take(register_views(run.scene, value))
-        return {cls.gives: [register_state(s, value) for s in states]}
+        return {cls.gives: [register_state(s, value) for s in states], "registration": value}

@@ -21,6 +21,7 @@ from p2gs.models.health import check_gaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
 from p2gs.models.phase import Phase, PhaseConfig, register_phase
 from p2gs.models.registered import correct_scene
+from p2gs.models.trial import Trial
 from p2gs.models.view_fit import ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
 from p2gs.ops.decay import exponential
 from p2gs.types import Camera, GaussianTensors, RenderOutput, TwoStateScene
@@ -219,41 +220,30 @@ class SingleStatePhase(StatePhase):
         self.errors.learn(config.rate * exponential(1.0, 0.01, fraction))
 
     def forgive(self, step: int) -> None:
-        """At their steps: decide which errors of photographs are looked for, and measure the gains; photographs lose
-        the gains known."""
+        """At their steps: decide which errors are looked for, cameras first, for a gain is told by pixels that lie on
+        one another; measure the gains; photographs lose the gains known."""
         config, errors = self.config.forgive, self.errors
-        due = [round(share * self.total_steps) for share in (config.at, *config.again)]
-        if step == due[0] and not bool(errors.decided):
-            self.decide()
-        elif step in due[1:] and bool(errors.on[0]):
-            self.measure()
+        g, views = self.splats.tensors().detach(), self.views[self.state]
+        due = [round(share * self.total_steps) for share in (config.at, *config.measured)]
+        if step == due[0] and config.cameras == "auto":
+            self.decide(1, "cameras", try_cameras(g, views, config, self.rasterizer))
+        if step in due[1:] and config.gains == "auto":
+            if not bool(errors.decided[0]):
+                self.decide(0, "gains", try_gains(g, views, errors, config, self.rasterizer))
+            if bool(errors.on[0]):
+                errors.log_gains += measure_gains(g, views, errors, config.levels[0], self.rasterizer)
         known = errors.log_gains.cpu()
         if bool(known.any()) and (self.without_gains is None or not torch.equal(known, self.without_gains)):
-            self.views[self.state] = TrainingViews(errors.views(self.shots), self.views[self.state].levels)
+            self.views[self.state] = TrainingViews(errors.views(self.shots), views.levels)
             self.without_gains = known.clone()
 
-    def decide(self) -> None:
-        config, errors, g = self.config.forgive, self.errors, self.splats.tensors().detach()
-        errors.decided.fill_(True)
-        for k, (wanted, name, judge) in enumerate(
-            ((config.gains, "gains", try_gains), (config.cameras, "cameras", try_cameras))
-        ):
-            if wanted == "never":
-                continue
-            found = judge(g, self.views[self.state], config, self.rasterizer)
-            errors.on[k] = found.passed(config.least)
-            print(
-                f"{self.phase_name}: {name} of single photographs: {found.told()}: {'on' if errors.on[k] else 'off'}",
-                flush=True,
-            )
-            if k == 0 and bool(errors.on[0]):
-                self.measure()
-                self.forgive(-1)  # the cameras are judged by photographs without gains
-
-    def measure(self) -> None:
-        self.errors.log_gains += measure_gains(
-            self.splats.tensors().detach(), self.views[self.state], self.config.forgive.levels[0], self.rasterizer
-        )
+    def decide(self, which: int, name: str, found: Trial) -> None:
+        """Switch gains (0) or cameras (1) on where held-out halves say so, and tell."""
+        self.errors.decided[which] = True
+        forgive = self.config.forgive
+        self.errors.on[which] = found.passed((forgive.least, forgive.least_cameras)[which])
+        outcome = "on" if self.errors.on[which] else "off"
+        print(f"{self.phase_name}: {name} of single photographs: {found.told()}: {outcome}", flush=True)
 
     def hand_over(self) -> StateGaussians:
         g, views, corrections = self.splats.tensors().clone(), self.views[self.state], self.errors.handed_over()

@@ -3,12 +3,13 @@
 The phases of a run are the config's ``stages``, in that order. What each hands over lies under a name, where later
 phases find it; a phase that gives a name anew replaces it for those after it. The names of the built-in phases:
 
-    states      two ``StateGaussians`` (start, end), registered to the start's frame
-    motions     ``PartMotions`` of discovery, None where articulation starts without
-    sharpened   the states once more, the same Gaussians sharpened
-    canonical   ``CanonicalGaussians``
-    learned     ``Articulation``
-    twin        what the finish wrote
+    states        two ``StateGaussians`` (start, end), registered to the start's frame
+    registration  the ``Registration`` by which they are
+    motions       ``PartMotions`` of discovery, None where articulation starts without
+    sharpened     the states once more, the same Gaussians sharpened
+    canonical     ``CanonicalGaussians``
+    learned       ``Articulation``
+    twin          what the finish wrote
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ CERTAIN = 3.0  # standard errors: one in a thousand by chance
 
 @dataclass(frozen=True)
 class Trial:
-    """without, with_it: mean errors of the held-out pictures.  better: share by which they fell, mean over pictures.
-    certain: the same in standard errors.  pictures: how many."""
+    """without, with_it: mean errors of the held-out pictures.  better: share by which their mean fell.  certain: the
+    same in standard errors over the pictures.  pictures: how many."""
 
     without: float
     with_it: float
@@ -32,7 +32,7 @@ class Trial:
 
 def trial(without: Tensor, with_it: Tensor) -> Trial:
     """Errors [N] of N held-out pictures without and with a correction."""
-    share = (1 - with_it / without.clamp_min(1e-12)).double()
+    share = ((without - with_it) / without.mean().clamp_min(1e-12)).double()
     n = len(share)
     deviation = float(share.std()) if n > 1 else float("inf")
     certain = float(share.mean()) / max(deviation / n**0.5, 1e-12) if n > 1 else 0.0

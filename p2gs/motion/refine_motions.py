@@ -191,6 +191,16 @@ class Judge:
         tried = self.refine(motions)
         return min(((*self(m), m) for m in (motions, tried)), key=lambda t: t[0])
 
+    def no_worse(self, before: PartMotions, after: PartMotions) -> PartMotions:
+        """``after``, but for the parts that ``before`` explains better: each goes back alone where the energy falls."""
+        best = self(after)[0]
+        for k, kind in enumerate(before.types):
+            tried = after.with_motion(k, kind, before.transforms[k])
+            energy = self(tried)[0]
+            if energy < best:
+                after, best = tried, energy
+        return after
+
 
 @dataclass
 class Seen:

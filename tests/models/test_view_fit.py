@@ -52,10 +52,11 @@ def pyramid(views) -> TrainingViews:
 def test_gains_are_measured():
     g, views = scene()
     shots, gains = exposed(views, 0.06)
-    found = measure_gains(g, pyramid(shots), SIZE, "auto")
+    known = ViewErrors(len(views))
+    found = measure_gains(g, pyramid(shots), known, SIZE, "auto")
     assert (found - gains).abs().max() < 0.015 and found.mean(0).abs().max() < 1e-12
-    assert try_gains(g, pyramid(shots), CONFIG, "auto").passed(CONFIG.least)
-    assert not try_gains(g, pyramid(views), CONFIG, "auto").passed(CONFIG.least)
+    assert try_gains(g, pyramid(shots), known, CONFIG, "auto").passed(CONFIG.least)
+    assert not try_gains(g, pyramid(views), known, CONFIG, "auto").passed(CONFIG.least)
 
 
 def test_only_real_errors_of_cameras_are_seen():
@@ -130,8 +131,8 @@ def test_a_phase_decides():
         box = torch.tensor([[-0.6, -0.2, -0.6], [0.6, 0.9, 0.6]])
         phase = SingleStatePhase(config, {}, TwoStateScene("panels", tuple(photos), box=box), 0, pyramid(photos))
         phase.splats = Splats(g)
-        phase.forgive(round(config.forgive.at * config.steps))
-        assert bool(phase.errors.decided) and bool(phase.errors.on[0]) == wrong
+        phase.forgive(round(config.forgive.measured[0] * config.steps))
+        assert bool(phase.errors.decided[0]) and bool(phase.errors.on[0]) == wrong
         found = phase.errors.handed_over()
         assert (found is None) != wrong
         if wrong:
