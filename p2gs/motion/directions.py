@@ -16,6 +16,7 @@ from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 
 WITHIN = 15.0  # degrees within which a direction is one that is known, or an axis is meant to lie along it
+SQUARE = 3.0  # degrees: directions that are so near to a right angle are at one
 FACING = 0.99  # cosine between a point's normal and the facing of the planes that it is taken for a point of: 8 degrees
 FEWEST = 20  # points of a plane
 ROUNDS = 3  # of planes found and fitted
@@ -33,7 +34,7 @@ def directions_of(states: list[StateGaussians], motions: PartMotions) -> Tensor:
 
 def _faced(states: list[StateGaussians], chosen: list[Tensor]) -> Tensor:
     """[D, 3]: ``shared_directions`` of the normals of the solid Gaussians ``chosen`` [N] bool of each state, each
-    fitted to the planes that face it (``common_normal``)."""
+    fitted to the planes that face it (``common_normal``), and squared with the others (``squared``)."""
     points, normals = [], []
     for state, of in zip(states, chosen, strict=True):
         g = state.gaussians.detach()
@@ -47,16 +48,52 @@ def _faced(states: list[StateGaussians], chosen: list[Tensor]) -> Tensor:
     if not len(found):
         return found
     gap = 0.5 * float(knn(points, None, 1, True)[0].median())
-    return torch.stack([common_normal(points.double(), normals.double(), d, gap) for d in found])
+    fits = [common_normal(points.double(), normals.double(), d, gap) for d in found]
+    return squared(torch.stack([d for d, _ in fits]), torch.stack([known for _, known in fits]))
 
 
-def common_normal(points: Tensor, normals: Tensor, direction: Tensor, gap: float) -> Tensor:
-    """The normal [3] that the planes share which face about ``direction`` [3]: least squares over all planes at once,
-    each with an offset of its own, Geman-McClure weights for what lies off its plane.
-
-    points, normals: [N, 3].  gap: offsets farther apart than this are of two planes.  The direction itself where no
-    plane faces it.
+def squared(directions: Tensor, known: Tensor) -> Tensor:
+    """Directions [D, 3] of which those within ``SQUARE`` of right angles to one another are at right angles: one
+    rotation of a frame, fitted to all of them by what is known of each, ``known`` [D, 3, 3] (information of its tilt).
+    Fronts, seen by every camera, are known ten times better than tops and undersides.
     """
+    off = torch.rad2deg(torch.asin((directions @ directions.T).abs().clamp_max(1)))
+    best: list[int] = []
+    for i in range(len(directions)):
+        group = [i]
+        for j in known.diagonal(dim1=1, dim2=2).sum(1).argsort(descending=True).tolist():
+            if j not in group and all(float(off[j, k]) < SQUARE for k in group):
+                group.append(j)
+        best = max(best, group, key=len)
+    if len(best) < 2:
+        return directions
+    U, _, Vt = torch.linalg.svd(directions[best])
+    frame = U @ Vt[: len(best)]  # the nearest with right angles
+    for _ in range(ROUNDS):
+        cross = torch.stack([_crossed(d) for d in frame])  # a small turn w moves a direction by cross @ w
+        H = (cross.transpose(1, 2) @ known[best] @ cross).sum(0)
+        g = (cross.transpose(1, 2) @ known[best] @ (directions[best] - frame)[..., None]).sum(0)
+        turn = torch.linalg.pinv(H, hermitian=True) @ g
+        frame = frame @ so3.rotvec_to_matrix(turn[:, 0]).T
+    out = directions.clone()
+    out[best] = frame
+    return out
+
+
+def _crossed(d: Tensor) -> Tensor:
+    """[3, 3] C with w x d = C w."""
+    return torch.linalg.cross(torch.eye(3, dtype=d.dtype), d.expand(3, 3)).T
+
+
+def common_normal(points: Tensor, normals: Tensor, direction: Tensor, gap: float) -> tuple[Tensor, Tensor]:
+    """The normal [3] that the planes share which face about ``direction`` [3]: least squares over all planes at once,
+    each with an offset of its own, Geman-McClure weights for what lies off its plane; and how well it is known, the
+    information [3, 3] of its tilt.
+
+    points, normals: [N, 3].  gap: offsets farther apart than this are of two planes.  The direction itself, and 0,
+    where no plane faces it.
+    """
+    known = torch.zeros(3, 3).double()
     points = points[(normals @ direction).abs() > FACING]
     for _ in range(ROUNDS if len(points) >= FEWEST else 0):
         e = torch.stack(list(perpendicular(direction)))
@@ -72,8 +109,8 @@ def common_normal(points: Tensor, normals: Tensor, direction: Tensor, gap: float
         if float(torch.linalg.matrix_rank(A)) < 2:
             break
         tilt = torch.linalg.solve(A, b)
-        direction = torch.nn.functional.normalize(direction - tilt @ e, dim=0)
-    return direction
+        direction, known = torch.nn.functional.normalize(direction - tilt @ e, dim=0), e.T @ A @ e
+    return direction, known
 
 
 def _tilt(across: Tensor, offset: Tensor, rounds: int = 5) -> tuple[Tensor, Tensor]:

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.motion.directions import axis_of, common_normal, directions_of, shared_axes, turned_onto
+from p2gs.motion.directions import axis_of, common_normal, directions_of, shared_axes, squared, turned_onto
 from p2gs.motion.screw_polish import PolishConfig, allowed_step, along_axes, apply_step
-from p2gs.ops import se3
+from p2gs.ops import se3, so3
 from p2gs.parts.askew import keep_shared, lay_axes
 from p2gs.types import GaussianTensors
 
@@ -68,8 +68,24 @@ def test_common_normal_is_that_of_several_planes_at_once():
     points[::50, 2] += 0.02  # some lie off their plane
     normals = UP.expand(900, 3)
     assert degrees_between(UP, truth) > 2
-    assert degrees_between(common_normal(points, normals, UP, 0.05), truth) < 0.1
-    assert torch.equal(common_normal(points, normals.roll(1, 1), UP, 0.05), UP)  # no plane faces that way
+    found, known = common_normal(points, normals, UP, 0.05)
+    assert degrees_between(found, truth) < 0.1
+    assert float((known @ found).norm()) < 1e-6 * float(known.norm())  # of its tilt alone, not of its length
+    found, known = common_normal(points, normals.roll(1, 1), UP, 0.05)
+    assert torch.equal(found, UP) and not known.any()  # no plane faces that way
+
+
+def test_directions_near_right_angles_are_at_right_angles():
+    """Two are known well, the third a hundred times worse and 1.5 degrees off; a fourth is of a slanted side."""
+    frame = so3.rotvec_to_matrix(torch.tensor([0.3, -0.2, 0.5]).double()).T
+    bad = so3.rotvec_to_matrix(1.5 * torch.pi / 180 * frame[0]) @ frame[2]
+    slanted = torch.nn.functional.normalize(frame[0] + 0.3 * frame[1], dim=0)
+    directions = torch.stack([frame[0], frame[1], bad, slanted])
+    known = torch.eye(3).double() - directions[:, :, None] * directions[:, None]
+    found = squared(directions, known * torch.tensor([1.0, 1, 0.01, 1])[:, None, None])
+    assert (found[:3] @ found[:3].T - torch.eye(3)).abs().max() < 1e-9 and torch.equal(found[3], slanted)
+    assert max(degrees_between(found[i], frame[i]) for i in range(3)) < 0.05
+    assert torch.equal(squared(directions[3:], known[3:]), directions[3:])
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
