@@ -277,15 +277,19 @@ def survey(
 
 
 def leave_false_minima(judge: Judge, motions: PartMotions, reach: list[float]) -> tuple[PartMotions, list[int]]:
-    """Refined motions once more from where ``survey`` lays the parts, kept if the energy falls.
+    """Refined motions once more from where ``survey`` lays the parts, as long as the energy falls.
 
     Returns them and which parts moved.
     """
+    gone: list[int] = []
     if judge.config.steps <= 0 or not reach or len(motions) == 0:
-        return motions, []
+        return motions, gone
     options = {"backend": judge.backend, "device": judge.device}
-    surveyed, moved = survey(judge.states, motions, judge.views, judge.config, judge.stacks, reach, **options)
-    if not moved:
-        return motions, []
-    value, _, surveyed = judge.improved(surveyed)
-    return (surveyed, moved) if value < judge(motions)[0] else (motions, [])
+    while True:
+        surveyed, moved = survey(judge.states, motions, judge.views, judge.config, judge.stacks, reach, **options)
+        if not moved:
+            return motions, gone
+        value, _, surveyed = judge.improved(surveyed)
+        if value >= judge(motions)[0]:
+            return motions, gone
+        motions, gone = surveyed, sorted({*gone, *moved})
