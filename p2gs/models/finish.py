@@ -227,7 +227,7 @@ def finish(
     if len(types):
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         judge = Judge(None, states, views, config.polish, stacks, **options)
-        refined = judge.no_worse(motions, judge.refine(motions))
+        refined = judge.no_worse(motions, judge.refine(motions)) if config.polish.steps > 0 else motions
         refined, _ = leave_false_minima(judge, refined, config.survey)
         refined, record.laid = lay_axes(judge, refined, config.askew)
         refined = keep_shared(judge, refined, axes)

@@ -244,8 +244,8 @@ def survey(
     one, that no descent leaves. reach: shifts tried to both sides of the part's two long directions (internal units).
     Returns the motions and which of them moved.
     """
-    seen = what_counts(states, motions, config, stacks, backend=backend, device=device)
-    options = {"level": config.levels[0], "seen": seen, "backend": backend, "device": device}
+    # what counts is asked of every place anew: by the Gaussians that fit where the part is now, no other place is better
+    options = {"level": config.levels[0], "backend": backend, "device": device}
     best = explanation_cost(states, motions, views, config, stacks, **options)
     moved = []
     for k in range(len(motions)):
