@@ -244,7 +244,7 @@ def survey(
     one, that no descent leaves. reach: shifts tried to both sides of the part's two long directions (internal units).
     Returns the motions and which of them moved.
     """
-    # what counts is asked of every place anew: by the Gaussians that fit where the part is now, no other place is better
+    # what counts is asked at every place anew: by the Gaussians that fit where the part is now, none is better
     options = {"level": config.levels[0], "backend": backend, "device": device}
     best = explanation_cost(states, motions, views, config, stacks, **options)
     moved = []
