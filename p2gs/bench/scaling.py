@@ -103,6 +103,7 @@ def measure(px: int, views: int, gaussians: int, threads: int, steps: int) -> Me
     from p2gs.config.run import load_config
     from p2gs.data.views import TrainingViews
     from p2gs.models.single_state import SingleStatePhase
+    from p2gs.models.view_fit import ViewFitConfig
     from p2gs.types import TwoStateScene
     from p2gs.visibility.evidence import gather_evidence
 
@@ -120,6 +121,7 @@ def measure(px: int, views: int, gaussians: int, threads: int, steps: int) -> Me
     options: Any = section.config
     options.levels, options.level_starts, options.steps = [px], [0.0], WARM + steps
     options.initial_gaussians = 100  # replaced
+    options.forgive = ViewFitConfig()  # its trials happen three times in a run and are no step's
     build: Any = SingleStatePhase
     phase = build(options, section.losses, scene, 0, prepared)
     phase.splats = start_of(gaussians, options.sh_degree)
