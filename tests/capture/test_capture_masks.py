@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from p2gs.data.capture.auto_masks import distorted, sharpened
-from p2gs.data.capture.coarse import Picture, fit, initial, object_rows, region_of
+from p2gs.data.capture.auto_masks import distorted, object_in, shares, sharpened
+from p2gs.data.capture.coarse import Picture, Region, fit, initial, region_of
 from p2gs.data.capture.given_masks import folder_masks, shown
+from p2gs.data.capture.hull import hull_of
 from p2gs.data.capture.model import Lens
 from p2gs.data.capture.photos import Shot
 from p2gs.data.generated.raytrace import render
@@ -53,13 +54,37 @@ def test_the_object_is_told_from_the_room():
     assert abs(region.planes[1] @ [1, 0, 0, 0]) > 0.99 and abs(region.planes[1][3] + 1.0) < 0.02
     splat = initial(region, xyz, np.full((len(xyz), 3), 128, np.uint8))
     fit(splat, pictures, region.distance, steps=250)
-    rows = object_rows(splat, region)
+    hull = hull_of(region, [(p.camera, shares(splat, region, p.camera) > 0.5) for p in pictures])
     overlaps = []
     for picture, truth in zip(pictures, truths, strict=True):
-        with torch.no_grad():
-            share = splat.render(picture.camera, features=rows[:, None].float()).features[..., 0].numpy() > 0.5
-        overlaps.append((share & truth).sum() / (share | truth).sum())
+        found = object_in(splat, region, hull, picture.camera, picture)
+        overlaps.append((found & truth).sum() / (found | truth).sum())
     assert np.median(overlaps) > 0.8, overlaps
+
+
+def test_a_hull_forgives_a_ragged_outline_and_leaves_out_what_stands_aside():
+    region = Region(np.array([0, 0, 0.5]), 3.0, np.array([[0.0, 0, 1, 0]]))
+    inside = np.random.default_rng(0).uniform((-0.3, -0.3, 0), (0.3, 0.3, 0.9), (60_000, 3))
+    aside = np.random.default_rng(1).uniform((0.9, -0.1, 0), (1.1, 0.1, 0.3), (20_000, 3))
+    outlines = []
+    for i, angle in enumerate(np.linspace(0, 2 * np.pi, 24, endpoint=False)):
+        view = look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.0 + 0.5 * (i % 3)]), (0, 0, 0.5))
+        camera = Camera(torch.tensor(view).float(), torch.tensor(K).float(), 128, 96)
+        alone, outline = np.zeros((96, 128), bool), np.zeros((96, 128), bool)
+        for drawn, points in ((alone, inside), (outline, inside), (outline, aside)):
+            local = points @ view[:3, :3].T + view[:3, 3]
+            x, y = (local[:, :2] / local[:, 2:] @ K[:2, :2] + K[:2, 2]).astype(int).T
+            shown = (x >= 0) & (x < 128) & (y >= 0) & (y < 96)
+            drawn[y[shown], x[shown]] = True
+        if i == 5:
+            outline[:, :64] = False  # half of it is missing in one photograph
+        outlines.append((camera, outline, alone))
+    hull = hull_of(region, [(c, o) for c, o, _ in outlines])
+    lo, hi = hull.points.min(0), hull.points.max(0)
+    assert np.abs(lo - [-0.3, -0.3, 0]).max() < 0.1 and np.abs(hi - [0.3, 0.3, 0.9]).max() < 0.1
+    camera, _, alone = outlines[5]
+    assert (alone & hull.outline(camera))[:, :64].sum() > 0.95 * alone[:, :64].sum() > 100
+    assert len(hull_of(region, [(c, np.zeros_like(o)) for c, o, _ in outlines]).points) == 0
 
 
 def test_sharpening_moves_an_edge_to_the_picture_and_not_further():

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from p2gs.data.capture.coarse import REGION, Picture, Region, fit, initial, object_rows, region_of
+from p2gs.data.capture.coarse import Picture, Region, Splat, fit, initial, object_rows, region_of
+from p2gs.data.capture.hull import Hull, hull_of
 from p2gs.data.capture.joint import is_end, states_of
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.write import pinhole_of
@@ -19,8 +20,6 @@ from p2gs.types import Camera, UserError
 COARSE = 200  # px, long edge of the splat's pictures
 SHARP = 480  # px, long edge that edges are sharpened at
 BAND = 0.012  # of the long edge, to either side of the drawn edge: two pixels of the splat's pictures
-# share of the photographs that must show a point within the outline; a ragged coarse outline misses some at its edge
-IN_HULL = 0.93
 PORE = 0.03  # of the mask: smaller holes are the coarse splat's, where a plain side gave it nothing to hold on to
 CHANGED = 0.15  # share of the mask that sharpening may change before it is not believed
 
@@ -82,30 +81,21 @@ def without_pores(mask: np.ndarray) -> np.ndarray:
     return mask | small[holes]
 
 
-def enclosed(splat, rows: torch.Tensor, pictures: list[Picture], region: Region) -> torch.Tensor:
-    """[N] bool: Gaussians that no photograph shows beside the object, though they are none of its body's.
+def shares(splat: Splat, region: Region, camera: Camera) -> np.ndarray:
+    """[h, w] how much of each pixel is neither floor nor wall."""
+    with torch.no_grad():
+        rows = object_rows(splat, region)[:, None].float()
+        return splat.render(camera, features=rows).features[..., 0].numpy()
 
-    A dark inside without texture is explained by floor and wall behind it, which nobody sees from elsewhere: what lies
-    in the hull of the body's outlines is the object's (Laurentini 1994, doi:10.1109/34.273735).
-    """
-    from scipy.ndimage import binary_fill_holes
 
-    means = splat.params["means"].detach()
-    near = (means - torch.tensor(region.centre).float()).norm(dim=1) < 1.1 * REGION * region.distance
-    seen, inside = torch.zeros(len(means)), torch.zeros(len(means))
-    for picture in pictures:
-        camera = picture.camera
-        with torch.no_grad():
-            share = splat.render(camera, features=rows[:, None].float()).features[..., 0].numpy()
-        outline = torch.from_numpy(binary_fill_holes(share > 0.5))
-        local = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        x = (local[:, 0] / local[:, 2] * camera.K[0, 0] + camera.K[0, 2]).floor().long()
-        y = (local[:, 1] / local[:, 2] * camera.K[1, 1] + camera.K[1, 2]).floor().long()
-        valid = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-        hit = outline[y.clamp(0, camera.height - 1), x.clamp(0, camera.width - 1)]
-        seen += valid
-        inside += valid & hit
-    return near & (seen >= 3) & (inside >= IN_HULL * seen)
+def object_in(splat: Splat, region: Region, hull: Hull, coarse: Camera, sharp: Picture) -> np.ndarray:
+    """[h, w] bool: the object in ``sharp``: what the splat shows within the hull, its edge sharpened. coarse: the
+    photograph's camera at the size that the hull was made by."""
+    import cv2
+
+    share = shares(splat, region, sharp.camera)
+    outline = cv2.resize(hull.outline(coarse).astype(np.float32), share.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return sharpened((255 * sharp.image.numpy()).astype(np.uint8), np.where(outline > 0.5, share, 0.0))
 
 
 def state_masks(model: Model, photos: Path, gains: dict, region: Region, end: bool) -> dict[str, np.ndarray]:
@@ -114,18 +104,16 @@ def state_masks(model: Model, photos: Path, gains: dict, region: Region, end: bo
     keys = [k for k, p in model.photos.items() if is_end(p.name) == end]
     mine = states_of(model)[:, int(end)]
     splat = initial(region, model.xyz[mine], model.rgb[mine])
-    fit(splat, pictures_of(model, photos, gains, keys, COARSE), region.distance)
-    rows = object_rows(splat, region)
-    if rows.sum() < 50:
+    pictures = pictures_of(model, photos, gains, keys, COARSE)
+    fit(splat, pictures, region.distance)
+    hull = hull_of(region, [(p.camera, shares(splat, region, p.camera) > 0.5) for p in pictures])
+    if len(hull.points) == 0:
         raise UserError(
             f"the object could not be told from the room in state '{'end' if end else 'start'}'; give --masks DIR"
         )
-    rows |= enclosed(splat, rows, pictures_of(model, photos, gains, keys, COARSE), region)
     out = {}
-    for key, sharp in zip(keys, pictures_of(model, photos, gains, keys, SHARP), strict=True):
-        with torch.no_grad():
-            share = splat.render(sharp.camera, features=rows[:, None].float()).features[..., 0].numpy()
-        mask = without_pores(sharpened((255 * sharp.image.numpy()).astype(np.uint8), share))
+    for key, coarse, sharp in zip(keys, pictures, pictures_of(model, photos, gains, keys, SHARP), strict=True):
+        mask = without_pores(object_in(splat, region, hull, coarse.camera, sharp))
         photo = model.photos[key]
         out[photo.name] = distorted(mask, model.lenses[photo.lens])
         if not out[photo.name].any():

@@ -1,8 +1,8 @@
 """A coarse splat of the whole scene in one state, and which of its Gaussians are the object.
 
 Gaussians start as a cloud around the point that the cameras look at, as a grid on the floor and on walls behind, and at
-the points of the model. After a few hundred steps the cloud's opaque ones are cut off floor and walls and joined to
-bodies; the body that the cameras look at is the object. Multi-view consistent by construction, and it needs no network
+the points of the model. After a thousand steps what the cloud shows off floor and walls has an outline in every
+photograph, and the body that the cameras look at in the hull of those is the object (``hull``). It needs no network
 that would have to know what a cupboard is.
 """
 
@@ -20,14 +20,12 @@ from p2gs.ops.sh import rgb_to_dc
 from p2gs.render import rasterize_stored
 from p2gs.types import Camera
 
-STEPS = 500
+STEPS = 1000
 CLOUD = 14_000  # Gaussians about the object: one per 5 cm of a cupboard
 GRID = 3_000  # per plane
 REGION = 0.5  # the cloud's radius over the cameras' distance: what a 50 degree lens shows
 OFF_PLANE = 0.012  # over the cameras' distance: nearer to floor or wall than this is floor or wall
-CELL = 0.03  # bodies are apart where a cell of this size over the distance is empty between them
 SPARSE = 0.01  # weight of the mean opacity: empty space is the cheaper explanation
-OPAQUE = 0.3
 MIN_WALL = 60  # points
 
 
@@ -173,23 +171,7 @@ def fit(splat: Splat, pictures: list[Picture], distance: float, steps: int = STE
 
 
 def object_rows(splat: Splat, region: Region) -> Tensor:
-    """[N] bool: the Gaussians of the body that the cameras look at."""
-    from scipy.ndimage import label
-
+    """[N] bool: the cloud's Gaussians off floor and walls: the object, what stands about, fog before plain walls."""
     means = splat.params["means"].detach().double().numpy()
-    opaque = torch.sigmoid(splat.params["opacity_logits"]).detach().numpy() > OPAQUE
-    small = splat.params["log_scales"].detach().exp().amax(1).numpy() < 0.08 * region.distance
-    inside = np.linalg.norm(means - region.centre, axis=1) < 1.1 * REGION * region.distance
-    rows = np.flatnonzero(opaque & small & inside & region.free(means))
-    out = torch.zeros(len(means), dtype=torch.bool)
-    if len(rows) == 0:
-        return out
-    cell = CELL * region.distance
-    index = np.floor((means[rows] - means[rows].min(0)) / cell).astype(int)
-    grid = np.zeros(index.max(0) + 1, bool)
-    grid[tuple(index.T)] = True
-    bodies = label(grid, np.ones((3, 3, 3)))[0][tuple(index.T)]
-    away = np.linalg.norm(means[rows] - region.centre, axis=1) / region.distance
-    weight = np.bincount(bodies, np.exp(-((away / 0.2) ** 2)))
-    out[rows[bodies == weight.argmax()]] = True
-    return out
+    near = np.linalg.norm(means - region.centre, axis=1) < 1.1 * REGION * region.distance
+    return torch.from_numpy((np.arange(len(means)) < splat.cloud) & near & region.free(means))

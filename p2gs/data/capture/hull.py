@@ -1,0 +1,78 @@
+"""The body that the outlines of many photographs have in common (visual hull, Laurentini 1994, DOI 10.1109/34.273735).
+
+Outlines are those of a coarse splat: a plain side is a fog there, and a dark inside is explained by what is behind it
+in one photograph or another. What nearly all photographs agree on is the object's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from p2gs.data.capture.coarse import REGION, Region
+from p2gs.types import Camera
+
+CELL = 0.01  # over the cameras' distance: one and a half pixels of a coarse picture
+IN_HULL = 0.93  # share of the photographs that must show a point within the outline; a ragged outline misses some
+FEWEST = 3  # photographs that must show a point at all
+MIDDLE = 0.2  # over the cameras' distance: how near to where they look a body is likely to be
+
+
+@dataclass(frozen=True)
+class Hull:
+    """points: [M, 3], the middles of the cells.  step: the cells' width."""
+
+    points: np.ndarray
+    step: float
+
+    def outline(self, camera: Camera) -> np.ndarray:
+        """[h, w] bool: the pixels that a cell covers, each drawn as a disc as wide as its diagonal."""
+        import cv2
+
+        x, y, z, shown = _projected(self.points, camera)
+        out = np.zeros((camera.height, camera.width), np.uint8)
+        radius = np.ceil(0.5 * np.sqrt(2) * self.step * float(camera.K[0, 0]) / np.maximum(z, 1e-9)).astype(int)
+        for r in np.unique(radius[shown]):
+            cells, of = np.zeros_like(out), shown & (radius == r)
+            cells[y[of], x[of]] = 1
+            out |= cv2.dilate(cells, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r - 1, 2 * r - 1)))
+        return out > 0
+
+
+def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
+    """The body in the region's middle that ``outlines`` [h, w] bool have in common; without cells where none is.
+
+    outlines: the camera and what is inside the outline, by photograph.
+    """
+    from scipy.ndimage import label
+
+    step, reach = CELL * region.distance, 1.1 * REGION * region.distance
+    side = np.arange(-reach, reach + step, step)
+    grid = (len(side),) * 3
+    points = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3) + region.centre
+    free = np.flatnonzero((points @ region.planes[:, :3].T > region.planes[:, 3]).all(1))
+    seen, inside = np.zeros(len(free)), np.zeros(len(free))
+    for camera, outline in outlines:
+        x, y, _, shown = _projected(points[free], camera)
+        seen += shown
+        inside[shown] += outline[y[shown], x[shown]]
+    solid = np.zeros(len(points), bool)
+    solid[free] = (seen >= FEWEST) & (inside >= IN_HULL * seen)
+    bodies = label(solid.reshape(grid), np.ones((3, 3, 3)))[0].ravel()
+    away = np.linalg.norm(points - region.centre, axis=1) / region.distance
+    weight = np.bincount(bodies, np.exp(-((away / MIDDLE) ** 2)))
+    weight[0] = 0.0
+    return Hull(points[(bodies == weight.argmax()) & solid], step)
+
+
+def _projected(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pixel column, row and depth of points [N, 3], and which the picture shows."""
+    M, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
+    local = points @ M[:3, :3].T + M[:3, 3]
+    z = local[:, 2]
+    front = np.where(z > 0, z, 1.0)
+    x = np.floor(local[:, 0] / front * K[0, 0] + K[0, 2])
+    y = np.floor(local[:, 1] / front * K[1, 1] + K[1, 2])
+    shown = (z > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    return np.where(shown, x, 0).astype(int), np.where(shown, y, 0).astype(int), z, shown
