@@ -23,6 +23,8 @@ from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.parts.askew import keep_shared, lay_axes
 from p2gs.parts.islands import settle_twin_islands
+from p2gs.parts.options import PartMotionsConfig
+from p2gs.parts.part_choices import drop_needless
 from p2gs.surface.contents import in_trays
 from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
 from p2gs.visibility.depth_stack import DepthStack
@@ -38,6 +40,8 @@ class FinishConfig:
     its own surface that are tried after it (internal units; [] = none). tune: then the Gaussians once more, with the
     screws frozen. min_mass: a slot with a smaller share of the solid Gaussians vanishes. min_motion: likewise one that
     moves its points by less (internal units).
+    part_penalty: share of the image loss that a part with an axis of its own must save against being static or one
+    with a part that it touches, as in discovery (0: parts stay).
     askew: share of the image loss that an axis which is askew to the object's directions must save against one
     along them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less than this many
     degrees is a slide. clean_neighbours: labels are the majority among this many neighbours at canonical time (0 =
@@ -59,6 +63,7 @@ class FinishConfig:
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     min_mass: float = 0.002
     min_motion: float = 0.01
+    part_penalty: float = PartMotionsConfig.part_penalty
     askew: float = 0.01
     prismatic_below: float = 5.0
     clean_neighbours: int = 8
@@ -231,8 +236,13 @@ def finish(
         refined, _ = leave_false_minima(judge, refined, config.survey)
         refined, record.laid = lay_axes(judge, refined, config.askew)
         refined = keep_shared(judge, refined, axes)
-        transforms = refined.transforms
-        record.after = transforms
+        refined, labels, gone = drop_needless(judge, refined, labels, config.part_penalty)
+        for part in gone:
+            notes.append(f"slot {alive.pop(part['part'])} of {len(learned.types)} vanished: {part['why']}")
+            transforms = torch.cat([transforms[: part["part"]], transforms[part["part"] + 1 :]])
+        types, record.labels, record.before = refined.types, refined.labels, transforms
+        record.after = transforms = refined.transforms
+    if len(types):
         record.polish = single_ways(states, refined, views, config.polish, stacks, **options)
         measure(record, states, types, views, stacks, level, backend, device)
     options["backend"] = twin_backend or backend

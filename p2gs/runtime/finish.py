@@ -4,6 +4,7 @@ exports."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 
 from p2gs.context import RunContext
@@ -45,6 +46,8 @@ class FinishStage(Stage):
         from p2gs.export.run_folder import complete_run, write_twin
 
         config, found_in, states = section.config, states, sharpened or states
+        if run.exact:
+            config = replace(config, part_penalty=0.0)  # as many slots as were asked for
         if registration is not None and registration.moved:
             learned, states = put_base_to_rest(run, config, learned, found_in, states, registration)
         backend = {"backend": run.backend, "twin_backend": run.rasterizer, "device": run.device}

@@ -1,8 +1,10 @@
 """Labels, slots and joints at the end; parts that are one become one."""
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
+import pytest
 import torch
 from tiny import hinge, photographs, slide, textured_panels
 
@@ -23,7 +25,7 @@ from p2gs.motion.joint_confidence import state_depth
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3
-from p2gs.parts.part_choices import join_twins, simplify, without_part
+from p2gs.parts.part_choices import drop_needless, join_twins, simplify, without_part
 from p2gs.types import GaussianTensors, Similarity
 
 
@@ -114,6 +116,40 @@ def test_one_part_cut_in_two_becomes_one_and_a_true_part_stays(monkeypatch):
     )
     simple = simplify(judge, half, 0.04)
     assert len(simple) == 1 and torch.equal(simple.labels[1], labels)
+
+
+@dataclass
+class Told:
+    """A judge that is told the image loss of one part in place of two; with what moves left to stand it is nine."""
+
+    states: list
+    moving: torch.Tensor
+    one: float
+    config: PolishConfig
+    further: float = 0.0
+
+    def __call__(self, motions):
+        stands = bool((motions.labels[0][self.moving] == 0).any())
+        cost = 9.0 if stands else (self.one if len(motions) == 1 else 1.0)
+        return math.log(cost), cost
+
+    def improved(self, motions):
+        return (*self(motions), motions)
+
+
+@pytest.mark.parametrize(("one", "left"), [(1.019, 1), (1.022, 2), (0.99, 1)])
+def test_a_part_that_saves_less_than_a_part_must_becomes_its_neighbours(one, left):
+    """A piece of a door that moves a little unlike the rest of it; a part must save a fiftieth."""
+    states, labels, _ = two_states(hinge())
+    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
+    other = se3.from_screw(torch.tensor([0.0, 0.2, 1]).double(), torch.tensor([0.4, 0.5, 0]).double(), 0.6)
+    margins = [torch.ones(len(cut))] * 2
+    motions = PartMotions(["revolute"] * 2, torch.stack([hinge(), other]), torch.ones(2), [cut, cut], margins)
+    judge = Told(states, cut > 0, one, PolishConfig())
+    kept, relabelled, gone = drop_needless(judge, motions, cut, 0.02)
+    assert len(kept) == left and torch.equal(relabelled, labels if left == 1 else cut)
+    assert len(gone) == 2 - left and all("revolute" in part["why"] for part in gone)
+    assert len(drop_needless(judge, motions, cut, 0.0)[0]) == 2  # switched off
 
 
 def test_touching_parts_of_one_motion_are_joined_and_others_stay():
