@@ -18,12 +18,13 @@ REPO = Path(__file__).parents[2]
 OUTPUTS = ("twin.json", "splats/*.ply", "meshes/*/*.ply")
 TIMEOUT = 1800.0  # seconds for a whole fit, on a machine that does other things as well
 
-# The smoke preset with states long enough that both moving parts are found, and a search that takes two seconds.
+# The smoke preset with states long enough, from faint to solid, that both moving parts are found, and a search of two
+# seconds.
 SMOKE = """
 include: [preset/smoke.yaml]
 data: {{format: synthetic, root: {root}, kind: demo, size: 64, train_views: 12, test_views: 2, depth: never}}
 phases:
-  single_state: {{steps: 300, initial_opacity: 0.1}}
+  single_state: {{steps: 300, initial_opacity: 0.1, rates: {{opacity_logits: 0.05}}}}
   discovery:
     evidence_size: 64
     look_steps: 4
