@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from p2gs.data.capture.marker_fit import fitted
 from p2gs.data.capture.model import Model, similarity
 from p2gs.types import UserError
 
@@ -83,11 +84,10 @@ def find_markers(path: Path, mirrored: bool = False) -> dict[int, np.ndarray]:
     """
     import cv2
 
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    factor = max(1, round(SMALL / max(grey.shape)))
-    if factor > 1:
-        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
-    grey = np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey
+    small = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    small = np.ascontiguousarray(small[:, ::-1]) if mirrored else small
+    factor = max(1, round(SMALL / max(small.shape)))
+    grey = cv2.resize(small, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC) if factor > 1 else small
     options = cv2.aruco.DetectorParameters()
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     options.minMarkerPerimeterRate = 0.012  # of the long edge: a marker 3 thousandths wide is what can be read at all
@@ -95,10 +95,9 @@ def find_markers(path: Path, mirrored: bool = False) -> dict[int, np.ndarray]:
     corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(), options).detectMarkers(grey)
     known, out = template(), {}
     for key, c in zip([] if ids is None else np.ravel(ids), corners, strict=True):
-        c = c.reshape(4, 2) + 0.5
-        c = np.stack([grey.shape[1] - c[:, 0], c[:, 1]], 1) if mirrored else c
-        if int(key) in known:
-            out[int(key)] = c / factor
+        c = fitted(small.astype(np.float32), int(key), (c.reshape(4, 2) + 0.5) / factor) if int(key) in known else None
+        if c is not None:
+            out[int(key)] = np.stack([small.shape[1] - c[:, 0], c[:, 1]], 1) if mirrored else c
     return out
 
 

@@ -40,7 +40,7 @@ class State:
     descriptors: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # arrays have no one answer to whether they are equal
 class Hypothesis:
     """T: [4, 4] similarity start -> end.  pairs: [n, 2] rows of start's and end's points that support it.
 

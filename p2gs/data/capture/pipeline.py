@@ -203,9 +203,10 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
     seen = marker_board.find_board([s.name for s in shots], work / "photos")
     found = hypotheses_of(*states, seen)
     facts = {"hypotheses": [h.to_dict() for h in found]}
-    chosen: Hypothesis = found[choose(found, options.static, Path(shots[0].source).parent)]
-    facts["static"] = found.index(chosen)
-    progress(f"static scene: hypothesis {facts['static']} with {len(chosen.pairs)} votes, spread {chosen.spread:.2f}")
+    static = choose(found, options.static, Path(shots[0].source).parent)
+    chosen: Hypothesis = found[static]
+    facts["static"] = static
+    progress(f"static scene: hypothesis {static} with {len(chosen.pairs)} votes, spread {chosen.spread:.2f}")
     corners: dict[int, int] = {}
 
     def with_board(model: Model) -> Model:
