@@ -126,6 +126,7 @@ def test_on_ray_with_a_node_killed_half_way(scenes, reference, monkeypatch):
     from ray.cluster_utils import Cluster
 
     monkeypatch.setenv("PYTHONPATH", str(REPO))
+    monkeypatch.setenv("P2GS_CALLS", str(scenes / "ray.calls"))  # workers have the environment that their node began in
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2})
     try:
         node = cluster.add_node(num_cpus=2)

@@ -21,6 +21,7 @@ MIN_CORNERS = 8  # two markers: one alone fixes the scale to a per cent at best
 FITS = 0.05  # rms of the corners over the board's diagonal: more and the sheet was not flat, or is another board
 # px: smaller photographs are enlarged before markers are sought, which are a dozen pixels wide from across a room
 SMALL = 2400
+WEIGHT = 10  # features that a corner counts as: it is known to a sixth of a pixel, they to half of one
 MIN_SIGHTINGS = 4  # markers over all photographs: textures that look like one do so once
 
 
@@ -116,10 +117,11 @@ def corner_id(marker: int, corner: int) -> int:
     return 4 * marker + corner
 
 
-def with_corners(model: Model, seen: dict[str, dict[int, np.ndarray]]) -> tuple[Model, dict[int, int]]:
+def with_corners(model: Model, seen: dict[str, dict[int, np.ndarray]], times: int = 1) -> tuple[Model, dict[int, int]]:
     """The model with a point for each marker corner that two photographs show, and {corner: id of its point}.
 
-    seen: photograph's name -> marker id -> [4, 2] corners.
+    seen: photograph's name -> marker id -> [4, 2] corners.  times: points that each corner becomes; in bundle
+    adjustment, which weighs all points alike, it counts as often.
     """
     rays: dict[int, list] = {}
     for key, photo in model.photos.items():
@@ -136,10 +138,11 @@ def with_corners(model: Model, seen: dict[str, dict[int, np.ndarray]]) -> tuple[
         if len(mine) < 2 or point is None:
             continue
         points[corner] = next_id
-        ids.append(next_id), xyz.append(point)
-        for key, _, _, pixel in mine:
-            added.setdefault(key, []).append((pixel, next_id))
-        next_id += 1
+        for point_id in range(next_id, next_id + times):
+            ids.append(point_id), xyz.append(point)
+            for key, _, _, pixel in mine:
+                added.setdefault(key, []).append((pixel, point_id))
+        next_id += times
     if not ids:
         return model, {}
     photos = dict(model.photos)

@@ -142,15 +142,17 @@ def join(
     folder: Path,
     extra=None,
     progress: Callable[[str], None] = lambda text: None,
+    by_board: bool = False,
 ) -> Model:
     """One adjusted model of both states in the start's frame.
 
     T: [4, 4] static similarity start -> end.  extra: function that adds tracks of its own to the merged model (marker
-    corners), or None.
+    corners), or None.  by_board: nothing but the board says T. Then no other point joins the states (a door moves
+    little beside its hinge, and would hold the open state there), and the lenses' middles stay where they are.
     """
     model = None
     for turn in range(ROUNDS):
-        pairs = guided_pairs(start, end, T)
+        pairs = np.zeros((0, 2), np.int64) if by_board else guided_pairs(start, end, T)
         progress(f"{len(pairs)} points seen in both states")
         model = merged(start.model, end.model, T, pairs)
         model = model if extra is None else extra(model)
@@ -159,7 +161,7 @@ def join(
         if turn + 1 < ROUNDS:
             T = _relative(model, start.model, end.model)
     assert model is not None  # there is at least one round
-    return filtered(adjusted(model, folder, True, progress))
+    return filtered(adjusted(model, folder, not by_board, progress))
 
 
 def _relative(model: Model, start: Model, end: Model) -> np.ndarray:

@@ -22,7 +22,7 @@ from p2gs.data.capture.hypotheses import Hypothesis, State
 from p2gs.data.capture.joint import is_end, join, state_bias, states_of
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred, lens_groups
-from p2gs.data.capture.static import check_joint_support, choose, hypotheses_of
+from p2gs.data.capture.static import check_board_link, check_joint_support, choose, hypotheses_of
 from p2gs.types import UserError
 
 STATES = ("start", "end")
@@ -211,13 +211,17 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
 
     def with_board(model: Model) -> Model:
         nonlocal corners
-        model, corners = marker_board.with_corners(model, seen)
+        model, corners = marker_board.with_corners(model, seen, marker_board.WEIGHT)
         return model
 
     depends = [chosen.T.tolist(), [sorted((k, v.tolist()) for k, v in m.items()) for m in seen.values()]]
 
     def make() -> dict:
-        write_model(join(*states, chosen.T, work / "joint", with_board, progress), work / "joined")
+        by_board = bool(chosen.board) and not chosen.wide
+        model = join(*states, chosen.T, work / "joint", with_board, progress, by_board)
+        if by_board:
+            check_board_link(model, Path(shots[0].source).parent)
+        write_model(model, work / "joined")
         return {"corners": corners}
 
     corners = {int(k): v for k, v in cache.get("joint", depends, make, progress)["corners"].items()}

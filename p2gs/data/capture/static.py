@@ -9,12 +9,13 @@ import numpy as np
 
 from p2gs.data.capture import board as marker_board
 from p2gs.data.capture.hypotheses import MIN_VOTES, RIVAL, Hypothesis, State, extent, find_hypotheses
-from p2gs.data.capture.joint import guided_pairs, states_of
+from p2gs.data.capture.joint import guided_pairs, state_bias, states_of
 from p2gs.data.capture.model import Model
 from p2gs.types import UserError
 
 # of the cameras' distance: hypotheses that move the object's place by less than this are one; a board alone is as exact
 SAME = 0.04
+LINKED = 0.001  # of the cameras' distance: farther apart than this the states do not hang together by the board alone
 ADVICE = (
     "lay newspapers, a patterned rug or the printed board (p2gs data board) around the object and photograph "
     "both states again"
@@ -71,6 +72,19 @@ def choose(found: list[Hypothesis], given: int | None, where: Path) -> int:
             f"leave the room as it is, or choose with --static 0 or --static {rivals[0]}"
         )
     return 0
+
+
+def check_board_link(model: Model, where: Path) -> None:
+    """Raises UserError where the states, joined by the marker board alone, do not see it at one place."""
+    bias, (_, distance) = state_bias(model), model.centre()
+    if not bias.shift < LINKED * distance:  # nan: too few corners that three photographs of each state show
+        seen = (
+            f"{100 * bias.shift / distance:.2f} % of the cameras' distance apart" if bias.points >= 6 else "too rarely"
+        )
+        raise UserError(
+            f"{where}: nothing but the marker board is seen to stand still in both states, and they see it {seen}; lay "
+            "it where most photographs show it whole, or " + ADVICE
+        )
 
 
 def check_joint_support(model: Model) -> dict:
