@@ -36,7 +36,8 @@ class Hull:
         for r in np.unique(radius[shown]):
             cells, of = np.zeros_like(out), shown & (radius == r)
             cells[y[of], x[of]] = 1
-            out |= cv2.dilate(cells, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r - 1, 2 * r - 1)))
+            disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r - 1, 2 * r - 1))
+            out = np.maximum(out, cv2.dilate(cells, disc))
         return out > 0
 
 
@@ -59,7 +60,7 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
         inside[shown] += outline[y[shown], x[shown]]
     solid = np.zeros(len(points), bool)
     solid[free] = (seen >= FEWEST) & (inside >= IN_HULL * seen)
-    bodies = label(solid.reshape(grid), np.ones((3, 3, 3)))[0].ravel()
+    bodies = np.asarray(label(solid.reshape(grid), np.ones((3, 3, 3)))[0]).ravel()  # type: ignore[index]
     away = np.linalg.norm(points - region.centre, axis=1) / region.distance
     weight = np.bincount(bodies, np.exp(-((away / MIDDLE) ** 2)))
     weight[0] = 0.0

@@ -58,8 +58,8 @@ def fitted(grey: np.ndarray, marker: int, corners: np.ndarray) -> np.ndarray | N
     def seen(c: np.ndarray) -> np.ndarray:
         H = cv2.getPerspectiveTransform(unit, c.astype(np.float32)).astype(np.float64)
         w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
-        at = [((H[i, 0] * x + H[i, 1] * y + H[i, 2]) / w - 0.5).astype(np.float32) for i in (0, 1)]
-        return cv2.remap(grey, *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float64)
+        column, row = [((H[i, 0] * x + H[i, 1] * y + H[i, 2]) / w - 0.5).astype(np.float32) for i in (0, 1)]
+        return cv2.remap(grey, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float64)
 
     c = corners.astype(np.float64).copy()
     for _ in range(ITERATIONS):
