@@ -14,7 +14,7 @@ from p2gs.data.capture.gains import solve_gains
 from p2gs.data.capture.hypotheses import State, find_hypotheses
 from p2gs.data.capture.joint import END_OFFSET, filtered, guided_pairs, merged, state_bias, states_of
 from p2gs.data.capture.model import Lens, Model, Photo
-from p2gs.data.capture.static import choose
+from p2gs.data.capture.static import check_board_link, choose
 from p2gs.data.generated.synthetic import look_at
 from p2gs.types import UserError
 
@@ -176,3 +176,34 @@ def test_the_board_gives_scale_and_up(tmp_path, mirrored):
     assert abs(np.cbrt(np.linalg.det(T[:3, :3])) / 2.5 - 1) < 0.005
     assert abs(T[2, 2]) / np.linalg.norm(T[:3, 2]) > np.cos(np.radians(0.5))  # the sheet lies level
     assert len(template()) == 12
+
+
+def joined_by_corners(seen_end):
+    """A joint model whose states share marker corners alone; where the end sees them [4, 4] from where they are."""
+    start, end, T = two_states(room=0, drawer=200)
+    floor = np.c_[np.random.default_rng(5).uniform((0.6, -0.1), (0.8, 0.1), (40, 2)), np.zeros(40)]
+    joint = merged(start.model, end.model, T, np.zeros((0, 2), np.int64))
+    ids = np.arange(10_000, 10_040)
+    photos = {}
+    for key, photo in joint.photos.items():
+        points = floor @ seen_end[:3, :3].T + seen_end[:3, 3] if photo.name.startswith("end") else floor
+        pixels = joint.pixels_of(key, points)
+        fine = np.isfinite(pixels).all(1)
+        photos[key] = replace(
+            photo, xy=np.vstack([photo.xy, pixels[fine]]), point=np.concatenate([photo.point, ids[fine]])
+        )
+    rgb = np.vstack([joint.rgb, np.zeros((40, 3), np.uint8)])
+    return Model(joint.lenses, photos, np.concatenate([joint.ids, ids]), np.vstack([joint.xyz, floor]), rgb)
+
+
+def test_states_that_see_the_board_at_two_places_are_refused():
+    check_board_link(joined_by_corners(np.eye(4)), Path("x"))
+    moved, turned = np.eye(4), np.eye(4)
+    moved[0, 3] = 0.01
+    turned[:3, :3] = Rotation.from_euler("z", 0.4, degrees=True).as_matrix()
+    for wrong in (moved, turned):
+        with pytest.raises(UserError, match=r"the marker board .* 0\.\d\d % of the cameras' distance apart"):
+            check_board_link(joined_by_corners(wrong), Path("x"))
+    start, end, T = two_states(room=0, drawer=200)
+    with pytest.raises(UserError, match="too rarely"):
+        check_board_link(merged(start.model, end.model, T, np.zeros((0, 2), np.int64)), Path("x"))

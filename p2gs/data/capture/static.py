@@ -15,6 +15,7 @@ from p2gs.types import UserError
 
 # of the cameras' distance: hypotheses that move the object's place by less than this are one; a board alone is as exact
 SAME = 0.04
+AROUND = 0.3  # of the cameras' distance: how far the object's surroundings go
 LINKED = 0.001  # of the cameras' distance: farther apart than this the states do not hang together by the board alone
 ADVICE = (
     "lay newspapers, a patterned rug or the printed board (p2gs data board) around the object and photograph "
@@ -25,7 +26,7 @@ ADVICE = (
 def apart(model: Model, A: np.ndarray, B: np.ndarray) -> float:
     """How far two similarities [4, 4] start -> end put the object's surroundings apart, over the cameras' distance."""
     centre, distance = model.centre()
-    offsets = np.vstack([np.zeros(3), 0.3 * distance * np.eye(3), -0.3 * distance * np.eye(3)])
+    offsets = np.vstack([np.zeros(3), AROUND * distance * np.eye(3), -AROUND * distance * np.eye(3)])
     points = centre + offsets
     between = points @ (A - B)[:3, :3].T + (A - B)[:3, 3]
     scale = np.cbrt(np.linalg.det(A[:3, :3]))
@@ -77,10 +78,9 @@ def choose(found: list[Hypothesis], given: int | None, where: Path) -> int:
 def check_board_link(model: Model, where: Path) -> None:
     """Raises UserError where the states, joined by the marker board alone, do not see it at one place."""
     bias, (_, distance) = state_bias(model), model.centre()
-    if not bias.shift < LINKED * distance:  # nan: too few corners that three photographs of each state show
-        seen = (
-            f"{100 * bias.shift / distance:.2f} % of the cameras' distance apart" if bias.points >= 6 else "too rarely"
-        )
+    apart = bias.shift / distance + AROUND * np.radians(bias.turn)
+    if not apart < LINKED:  # nan: too few corners that three photographs of each state show
+        seen = f"{100 * apart:.2f} % of the cameras' distance apart" if np.isfinite(apart) else "too rarely"
         raise UserError(
             f"{where}: nothing but the marker board is seen to stand still in both states, and they see it {seen}; lay "
             "it where most photographs show it whole, or " + ADVICE
