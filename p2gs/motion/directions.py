@@ -16,6 +16,7 @@ from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 
 WITHIN = 15.0  # degrees within which a direction is one that is known, or an axis is meant to lie along it
+KNOWN = 1.0  # degrees to which directions are known, or an axis is another's
 SQUARE = 3.0  # degrees: directions that are so near to a right angle are at one
 FACING = 0.99  # cosine between a point's normal and the facing of the planes that it is taken for a point of: 8 degrees
 FEWEST = 20  # points of a plane
@@ -145,6 +146,15 @@ def shared_axes(transforms: Tensor, types: list[str]) -> Tensor:
         if int(one_way(ways, ways[k]).sum()) > 1:
             out[k] = ways[k]
     return out
+
+
+def has_own_axis(motions: PartMotions, part: int) -> bool:
+    """Whether no other slide goes along the slide ``part``, to ``KNOWN`` degrees; a turn's axis is its own."""
+    if motions.types[part] != "prismatic":
+        return True
+    ways = [axis_of("prismatic", T) for T in motions.transforms]
+    others = [w for k, w in enumerate(ways) if k != part and motions.types[k] == "prismatic"]
+    return all(abs(float(w @ ways[part])) < math.cos(math.radians(KNOWN)) for w in others)
 
 
 def turned_onto(kind: str, T: Tensor, direction: Tensor, middle: Tensor) -> Tensor:

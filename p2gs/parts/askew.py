@@ -10,12 +10,10 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
-from p2gs.motion.directions import WITHIN, axis_of, directions_of, shared_axes, turned_onto
+from p2gs.motion.directions import KNOWN, WITHIN, axis_of, directions_of, shared_axes, turned_onto
 from p2gs.motion.discovery.rigid import one_way
 from p2gs.motion.refine_motions import Judge
 from p2gs.parts.settle import relabelled
-
-KNOWN = 1.0  # degrees to which directions are known; an axis that is nearer keeps what photographs say
 
 
 def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMotions, list[dict]]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.directions import has_own_axis
 from p2gs.motion.discovery import as_motions, axes_used
 from p2gs.motion.refine_motions import Judge
 from p2gs.ops import se3, so3
@@ -16,26 +17,28 @@ from p2gs.ops.knn import knn
 
 
 def simplify(
-    judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None, joins: bool = False
+    judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None, final: bool = False
 ) -> PartMotions:
     """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the
     energy does not rise; drop a part, too, that has an axis of its own and saves less of the image loss than a further
     one must (``judge.further``).
 
     log: told of each part that goes: what was done, its index then, the label that its Gaussians got (numbered as
-    then), its type, image loss with and without it, what the energy gains.  joins: a part may go to any that it
-    touches, too, not to the static one alone; sensible once motions are final.
+    then), its type, image loss with and without it, what the energy gains.  final: motions are known for good. Then a
+    part may go to any that it touches, not to the static one alone; and none goes that shares its axis, for of a row's
+    shut drawers photographs alone know little.
     """
     lowest, cost = judge(motions)
     tried: set[tuple] = set()
     while len(motions):
-        for change, reduced in _reductions(judge.states, motions, same_motion, joins):
+        for change, reduced in _reductions(judge.states, motions, same_motion, final):
             if change in tried:
                 continue
             tried.add(change)
             value, lower = judge(reduced)
-            junk = change[0] != "merge" and lonely(motions, reduced) and cost > lower * (1 - judge.further)
-            if value <= lowest or junk:
+            alone = has_own_axis(motions, change[1]) if final else lonely(motions, reduced)
+            junk = change[0] != "merge" and alone and cost > lower * (1 - judge.further)
+            if junk or (value <= lowest and not final):
                 break
         else:
             return motions
@@ -58,7 +61,7 @@ def drop_needless(
     gone: list[dict] = []
     if penalty <= 0 or judge.config.steps <= 0:
         return motions, labels, gone
-    fewer = simplify(replace(judge, further=penalty), motions, 0.0, gone, joins=True)
+    fewer = simplify(replace(judge, further=penalty), motions, 0.0, gone, final=True)
     for count, part in zip(range(len(motions), 0, -1), gone, strict=False):
         labels = renumbering(count, part["part"], part["into"])[labels]
         share = 100 * (1 - part["cost_with"] / part["cost_without"])

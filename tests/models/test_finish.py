@@ -190,3 +190,18 @@ def test_empty_and_unmoving_slots_vanish_with_a_word():
         .joint
     )
     assert seen == (0.0, further.motion) and further.limits[0] <= 0.0 and further.limits[1] > seen[1]
+
+
+def test_a_drawer_of_a_row_stays_though_photographs_hardly_need_it():
+    """Its front is shut and plain; that it goes the row's way is no accident."""
+    states, labels, _ = two_states(slide())
+    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
+    further = slide()
+    further[:3, 3] *= 1.3
+    margins = [torch.ones(len(cut))] * 2
+    row = PartMotions(["prismatic"] * 2, torch.stack([slide(), further]), torch.ones(2), [cut, cut], margins)
+    assert len(drop_needless(Told(states, cut > 0, 0.99, PolishConfig()), row, cut, 0.02)[0]) == 2
+    askew = further.clone()
+    askew[:3, 3] += torch.linalg.norm(further[:3, 3]) * 0.05 * torch.tensor([0.0, 0.0, 1.0])
+    two = PartMotions(["prismatic"] * 2, torch.stack([slide(), askew]), torch.ones(2), [cut, cut], margins)
+    assert len(drop_needless(Told(states, cut > 0, 0.99, PolishConfig()), two, cut, 0.02)[0]) == 1
