@@ -14,7 +14,7 @@ from p2gs.data.capture.gains import solve_gains
 from p2gs.data.capture.hypotheses import State, find_hypotheses
 from p2gs.data.capture.joint import END_OFFSET, filtered, guided_pairs, merged, state_bias, states_of
 from p2gs.data.capture.model import Lens, Model, Photo
-from p2gs.data.capture.static import check_board_link, choose
+from p2gs.data.capture.static import board_link, check_board_link, choose
 from p2gs.data.generated.synthetic import look_at
 from p2gs.types import UserError
 
@@ -197,13 +197,13 @@ def joined_by_corners(seen_end):
 
 
 def test_states_that_see_the_board_at_two_places_are_refused():
-    check_board_link(joined_by_corners(np.eye(4)), Path("x"))
+    check_board_link(board_link(joined_by_corners(np.eye(4))), Path("x"))
     moved, turned = np.eye(4), np.eye(4)
     moved[0, 3] = 0.01
     turned[:3, :3] = Rotation.from_euler("z", 0.4, degrees=True).as_matrix()
     for wrong in (moved, turned):
         with pytest.raises(UserError, match=r"the marker board .* 0\.\d\d % of the cameras' distance apart"):
-            check_board_link(joined_by_corners(wrong), Path("x"))
+            check_board_link(board_link(joined_by_corners(wrong)), Path("x"))
     start, end, T = two_states(room=0, drawer=200)
     with pytest.raises(UserError, match="too rarely"):
-        check_board_link(merged(start.model, end.model, T, np.zeros((0, 2), np.int64)), Path("x"))
+        check_board_link(board_link(merged(start.model, end.model, T, np.zeros((0, 2), np.int64))), Path("x"))

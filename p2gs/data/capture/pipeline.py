@@ -8,6 +8,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Optional
 
@@ -22,7 +23,7 @@ from p2gs.data.capture.hypotheses import Hypothesis, State
 from p2gs.data.capture.joint import is_end, join, state_bias, states_of
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred, lens_groups
-from p2gs.data.capture.static import check_board_link, check_joint_support, choose, hypotheses_of
+from p2gs.data.capture.static import LINKED, board_link, check_board_link, check_joint_support, choose, hypotheses_of
 from p2gs.types import UserError
 
 STATES = ("start", "end")
@@ -214,13 +215,15 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
         model, corners = marker_board.with_corners(model, seen, marker_board.WEIGHT)
         return model
 
+    joined = partial(join, *states, chosen.T, work / "joint", with_board, progress)
     depends = [chosen.T.tolist(), [sorted((k, v.tolist()) for k, v in m.items()) for m in seen.values()]]
 
     def make() -> dict:
-        by_board = bool(chosen.board) and not chosen.wide
-        model = join(*states, chosen.T, work / "joint", with_board, progress, by_board)
-        if by_board:
-            check_board_link(model, Path(shots[0].source).parent)
+        model = joined(by_board=bool(chosen.board) and not chosen.wide)
+        if chosen.board and chosen.wide and not board_link(model) < LINKED:
+            model = joined(by_board=True)  # a few points that hardly moved passed for the room
+        if chosen.board:
+            check_board_link(board_link(model), Path(shots[0].source).parent)
         write_model(model, work / "joined")
         return {"corners": corners}
 

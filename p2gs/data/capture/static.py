@@ -75,14 +75,19 @@ def choose(found: list[Hypothesis], given: int | None, where: Path) -> int:
     return 0
 
 
-def check_board_link(model: Model, where: Path) -> None:
-    """Raises UserError where the states, joined by the marker board alone, do not see it at one place."""
+def board_link(model: Model) -> float:
+    """How far apart the states see what stands still in both, the object's surroundings taken along, over the cameras'
+    distance; NaN where three photographs of each state show too little of it."""
     bias, (_, distance) = state_bias(model), model.centre()
-    apart = bias.shift / distance + AROUND * np.radians(bias.turn)
-    if not apart < LINKED:  # nan: too few corners that three photographs of each state show
+    return float(bias.shift / distance + AROUND * np.radians(bias.turn))
+
+
+def check_board_link(apart: float, where: Path) -> None:
+    """Raises UserError where states that the marker board joins do not see it at one place (``board_link``)."""
+    if not apart < LINKED:
         seen = f"{100 * apart:.2f} % of the cameras' distance apart" if np.isfinite(apart) else "too rarely"
         raise UserError(
-            f"{where}: nothing but the marker board is seen to stand still in both states, and they see it {seen}; lay "
+            f"{where}: little but the marker board is seen to stand still in both states, and they see it {seen}; lay "
             "it where most photographs show it whole, or " + ADVICE
         )
 
