@@ -126,8 +126,8 @@ def make_room(kind: str, seed: int) -> Room:
         texture = Mosaic(100 * seed + 50 + k) if rich else plain(rng.uniform(0.3, 0.8, 3))
         still.append(box((*at, 0), (*(at + size[:2]), size[2]), texture))
     if kind == "board":
-        side = -1 if joint["type"] == "rotate" and joint["axis"]["o"][1] > 0 else 1  # not under an open door
-        still.append(board_sheet(high[0] + rng.uniform(0.2, 0.4), side * (high[1] + rng.uniform(0.1, 0.2))))
+        # on the side away from the hinge, where no open door stands over it
+        still.append(board_sheet(high[0] + rng.uniform(0.2, 0.4), high[1] + rng.uniform(0.1, 0.2)))
     return Room(still, front, motion, joint)
 
 

@@ -94,9 +94,9 @@ def find_markers(path: Path, mirrored: bool = False) -> dict[int, np.ndarray]:
     options.minMarkerPerimeterRate = 0.012  # of the long edge: a marker 3 thousandths wide is what can be read at all
     options.perspectiveRemovePixelPerCell = 8
     corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(), options).detectMarkers(grey)
-    known, out = template(), {}
+    known, out, picture = template(), {}, small.astype(np.float32)
     for key, c in zip([] if ids is None else np.ravel(ids), corners, strict=True):
-        c = fitted(small.astype(np.float32), int(key), (c.reshape(4, 2) + 0.5) / factor) if int(key) in known else None
+        c = fitted(picture, int(key), (c.reshape(4, 2) + 0.5) / factor) if int(key) in known else None
         if c is not None:
             out[int(key)] = np.stack([small.shape[1] - c[:, 0], c[:, 1]], 1) if mirrored else c
     return out
