@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from p2gs.data.capture.auto_masks import distorted, object_in, shares, sharpened
-from p2gs.data.capture.coarse import Picture, Region, fit, initial, region_of
+from p2gs.data.capture.coarse import Picture, Region, fit, initial, object_rows, region_of
 from p2gs.data.capture.given_masks import folder_masks, shown
 from p2gs.data.capture.hull import hull_of
 from p2gs.data.capture.model import Lens
@@ -54,10 +54,11 @@ def test_the_object_is_told_from_the_room():
     assert abs(region.planes[1] @ [1, 0, 0, 0]) > 0.99 and abs(region.planes[1][3] + 1.0) < 0.02
     splat = initial(region, xyz, np.full((len(xyz), 3), 128, np.uint8))
     fit(splat, pictures, region.distance, steps=250)
-    hull = hull_of(region, [(p.camera, shares(splat, region, p.camera) > 0.5) for p in pictures])
+    rows = object_rows(splat, region)
+    hull = hull_of(region, [(p.camera, shares(splat, rows, p.camera) > 0.5) for p in pictures])
     overlaps = []
     for picture, truth in zip(pictures, truths, strict=True):
-        found = object_in(splat, region, hull, picture.camera, picture)
+        found = object_in(splat, rows, hull, picture.camera, picture)
         overlaps.append((found & truth).sum() / (found | truth).sum())
     assert np.median(overlaps) > 0.8, overlaps
 

@@ -81,19 +81,18 @@ def without_pores(mask: np.ndarray) -> np.ndarray:
     return mask | small[holes]
 
 
-def shares(splat: Splat, region: Region, camera: Camera) -> np.ndarray:
-    """[h, w] how much of each pixel is neither floor nor wall."""
+def shares(splat: Splat, rows: torch.Tensor, camera: Camera) -> np.ndarray:
+    """[h, w] how much of each pixel Gaussians ``rows`` [N] bool show: what is neither floor nor wall."""
     with torch.no_grad():
-        rows = object_rows(splat, region)[:, None].float()
-        return splat.render(camera, features=rows).features[..., 0].numpy()
+        return splat.render(camera, features=rows[:, None].float()).features[..., 0].numpy()
 
 
-def object_in(splat: Splat, region: Region, hull: Hull, coarse: Camera, sharp: Picture) -> np.ndarray:
+def object_in(splat: Splat, rows: torch.Tensor, hull: Hull, coarse: Camera, sharp: Picture) -> np.ndarray:
     """[h, w] bool: the object in ``sharp``: what the splat shows within the hull, its edge sharpened. coarse: the
     photograph's camera at the size that the hull was made by."""
     import cv2
 
-    share = shares(splat, region, sharp.camera)
+    share = shares(splat, rows, sharp.camera)
     outline = cv2.resize(hull.outline(coarse).astype(np.float32), share.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return sharpened((255 * sharp.image.numpy()).astype(np.uint8), np.where(outline > 0.5, share, 0.0))
 
@@ -106,14 +105,15 @@ def state_masks(model: Model, photos: Path, gains: dict, region: Region, end: bo
     splat = initial(region, model.xyz[mine], model.rgb[mine])
     pictures = pictures_of(model, photos, gains, keys, COARSE)
     fit(splat, pictures, region.distance)
-    hull = hull_of(region, [(p.camera, shares(splat, region, p.camera) > 0.5) for p in pictures])
+    rows = object_rows(splat, region)
+    hull = hull_of(region, [(p.camera, shares(splat, rows, p.camera) > 0.5) for p in pictures])
     if len(hull.points) == 0:
         raise UserError(
             f"the object could not be told from the room in state '{'end' if end else 'start'}'; give --masks DIR"
         )
     out = {}
     for key, coarse, sharp in zip(keys, pictures, pictures_of(model, photos, gains, keys, SHARP), strict=True):
-        mask = without_pores(object_in(splat, region, hull, coarse.camera, sharp))
+        mask = without_pores(object_in(splat, rows, hull, coarse.camera, sharp))
         photo = model.photos[key]
         out[photo.name] = distorted(mask, model.lenses[photo.lens])
         if not out[photo.name].any():
