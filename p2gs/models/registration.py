@@ -8,6 +8,7 @@ The same for the gain. Clean states stay as they are.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
@@ -39,7 +40,8 @@ class RegistrationConfig:
     """Options of the states' registration. Lengths are shares of the box's diagonal.
 
     motion, gain: "auto" (held-out photographs decide) or "never".  reach: distance up to which unmoved surfaces are
-    looked for; states brought together by hand are off by about a hundredth.  steps: of refinement by photographs, a
+    looked for; states brought together by hand are off by about a hundredth. An object that moved farther as one is a
+    part that has no base.  steps: of refinement by photographs, a
     side and size.  sizes: of those photographs, pixels.  surfels: at most so many a state.  least: share by which
     held-out errors must fall.  least_shift: a motion that moves surfaces by less is not applied: a tenth of a pixel of
     the finest photographs.
@@ -90,39 +92,49 @@ def align_states(
     moved = NOTHING
     for size in config.levels if config.motion == "auto" else ():
         T = fit_photographs(pair.sides(gain), T, fitted, config.steps, size, tolerance, backend=backend)
-        shots = pair.judges(judged, size, T)
-        moved = trial(pair.errors(shots, still, gain, STRUCTURE), pair.errors(shots, T, gain, STRUCTURE))
+        moved = pair.tried(judged, size, still, T, gain)
         if not moved.passed(config.least):
             break  # states that lie on one another need no finer look
     points = surfels[1].points.double()
     shift = float((se3.apply(T, points) - points).norm(dim=1).square().mean().sqrt()) / diagonal
-    apply_motion = config.motion == "auto" and shift > config.least_shift and moved.passed(config.least)
+    why_not = ""
+    if moved.passed(config.least) and shift > config.reach:
+        why_not = f", as that is more than {100 * config.reach:.0f} %: what moved that far is taken for a part"
+    elif moved.passed(config.least) and pair.tried(judged, config.levels[-1], T, still, gain).better >= 0:
+        # a lid that was lifted lies on itself if the pot fell, too: then the pot's own photographs are worse
+        why_not = ", as what stands still without it would be worse"
+    apply_motion = moved.passed(config.least) and shift > config.least_shift and not why_not
     best = T if apply_motion else still
     shots = pair.judges(judged, config.levels[-1], best)
     dimmer = trial(pair.errors(shots, best, dark, COLOUR), pair.errors(shots, best, gain, COLOUR))
     apply_gain = config.gain == "auto" and dimmer.passed(config.least)
-    angle = float(torch.rad2deg(so3.rotation_angle(T[:3, :3])))
     figures = {
         "share": found.share,
         "spread": found.spread / diagonal,
         "rms": found.rms / diagonal,
         "shift": shift,
-        "angle": angle,
+        "angle": float(torch.rad2deg(so3.rotation_angle(T[:3, :3]))),
         "log_gain": gain.tolist(),
         "motion": {"applied": apply_motion, **vars(moved)},
         "gain": {"applied": apply_gain, **vars(dimmer)},
     }
-    beside = (
-        f"{100 * shift:.3f} % of the object and {angle:.3f} degrees beside the start, by "
-        f"{100 * found.share:.0f} % of its surface"
-    )
-    say(f"the end lies {beside}; {moved.told()}: {'applied' if apply_motion else 'not applied'}")
-    factors = ", ".join(f"{g:.3f}" for g in gain.exp().tolist())
-    say(
-        f"the end's red, green and blue are {factors} times the start's; {dimmer.told()}: "
-        f"{'applied' if apply_gain else 'not applied'}"
-    )
+    for line in _told(figures, moved, dimmer, why_not):
+        say(line)
     return Registration(best, gain if apply_gain else dark, figures)
+
+
+def _told(figures: dict, moved: Trial, dimmer: Trial, why_not: str) -> list[str]:
+    """The two decisions for the user."""
+    applied = {k: "applied" if figures[k]["applied"] else "not applied" for k in ("motion", "gain")}
+    beside = (
+        f"{100 * figures['shift']:.3f} % of the object and {figures['angle']:.3f} degrees beside the start, by "
+        f"{100 * figures['share']:.0f} % of its surface"
+    )
+    factors = ", ".join(f"{math.exp(g):.3f}" for g in figures["log_gain"])
+    return [
+        f"the end lies {beside}; {moved.told()}: {applied['motion']}{why_not}",
+        f"the end's red, green and blue are {factors} times the start's; {dimmer.told()}: {applied['gain']}",
+    ]
 
 
 @dataclass
@@ -154,6 +166,11 @@ class Pair:
             gain = median_gain(shot.image, drawn.colour, (weight > 0) & (shot.alpha > 0.99) & (drawn.alpha > 0.99))
             found += [] if gain is None else [gain.cpu()]
         return torch.stack(found).median(0).values if found else torch.zeros(3)
+
+    def tried(self, picks: list[list[int]], size: int, without: Tensor, with_it: Tensor, gain: Tensor) -> Trial:
+        """One motion in place of another, by the held-out pixels where nothing moved by the new one."""
+        shots = self.judges(picks, size, with_it)
+        return trial(*(self.errors(shots, T, gain, STRUCTURE) for T in (without, with_it)))
 
     def judges(self, picks: list[list[int]], size: int, transform: Tensor) -> list[tuple[int, TargetImage, Tensor]]:
         """Held-out photographs of the end and of the start: the side, the picture, and where nothing moved by

@@ -21,7 +21,7 @@ from p2gs.models.registered import (
     register_views,
     write_registration,
 )
-from p2gs.models.registration import RegistrationConfig, align_states
+from p2gs.models.registration import Pair, RegistrationConfig, align_states
 from p2gs.models.trial import held_out, trial
 from p2gs.motion.surface_fit import fit_surfaces
 from p2gs.ops import se3
@@ -99,13 +99,16 @@ def test_trial_wants_size_and_certainty():
     assert sorted(kept + out) == list(range(10)) and len(out) == 2
 
 
-def panels(dim: float, beside: torch.Tensor) -> tuple[list[StateGaussians], TwoStateScene]:
-    """Two perfect states, 0.6 radians of one panel apart; the end's world lies ``beside`` the start's and is exp(dim)
-    as bright."""
-    g, labels = textured_panels(1500)
-    turn = se3.from_screw(torch.tensor([0.0, 0, 1]).double(), torch.tensor([0.4, 0.5, 0]).double(), 0.6)
+TURN = se3.from_screw(torch.tensor([0.0, 0, 1]).double(), torch.tensor([0.4, 0.5, 0]).double(), 0.6)
+
+
+def panels(dim: float, beside: torch.Tensor, motion=TURN, g=None) -> tuple[list[StateGaussians], TwoStateScene]:
+    """Two perfect states, one panel's ``motion`` (0.6 radians) apart; the end's world lies ``beside`` the start's and
+    is exp(dim) as bright."""
+    drawn, labels = textured_panels(1500)
+    g = drawn if g is None else g
     views, states = [], []
-    for state, T in enumerate((torch.eye(4).double(), turn)):
+    for state, T in enumerate((torch.eye(4).double(), motion)):
         shots = photographs(g, labels, T, state, 96, 12)
         moved = register_state(StateGaussians(1, g), Registration(T, torch.zeros(3))).gaussians
         own = type(g)(
@@ -144,6 +147,43 @@ def test_aligned_states_stay():
     states, scene = panels(0.0, torch.eye(4).double())
     found = aligned(states, scene)
     assert found.is_identity and register_state(states[1], found) is states[1] and register_views(scene, found) is scene
+
+
+def push(x: float, z: float) -> torch.Tensor:
+    T = torch.eye(4).double()
+    T[:3, 3] = torch.tensor([x, 0.0, z])
+    return T
+
+
+def test_what_moved_as_one_and_far_is_no_other_frame():
+    """Both panels 0.15 beside their places: as one rigid motion explains all, but captures are not that far apart."""
+    said: list[str] = []
+    states, scene = panels(0.0, push(-0.15, 0.0))
+    found = aligned(states, scene, said.append)
+    trial_of = found.figures["motion"]
+    assert trial_of["better"] > 0.3 and trial_of["certain"] > 3  # photographs alone would have it
+    assert found.is_identity and not trial_of["applied"] and "taken for a part" in said[0]
+
+
+def test_a_slide_along_the_base_is_no_other_frame():
+    """A textured panel slides along its normal, and along a plain one. Where nothing moved if the whole end did is the textured panel and
+    the plain one's middle, which cannot tell; the plain one's edges are only among the pixels where nothing moved if
+    it did not."""
+    g, labels = textured_panels(1500)
+    sideways = g.means[:, [1, 0, 2]] + torch.tensor([-0.5, 0.5, 0.0])
+    plain = replace(
+        g,
+        sh=torch.where((labels == 0)[:, None, None], 0.6, g.sh),
+        means=torch.where((labels == 1)[:, None], sideways, g.means),
+    )
+    still, slid = torch.eye(4).double(), push(0.06, 0.0)
+    states, scene = panels(0.0, still, slid, plain)
+    views = {s: TrainingViews(scene.select(state=s), [96], crop=False) for s in (0, 1)}
+    pair = Pair(states[0].gaussians, states[1].gaussians, views, 0.01, "auto")
+    picks, back = [list(range(12))] * 2, se3.inverse(slid)
+    gained, lost = (pair.tried(picks, 96, *pair_of, torch.zeros(3)) for pair_of in ((still, back), (back, still)))
+    assert gained.passed(0.02) and lost.better > 0, (gained, lost)
+    assert aligned(states, scene).is_identity
 
 
 def test_never():
