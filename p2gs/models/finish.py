@@ -17,8 +17,9 @@ from p2gs.models.tune import TuneConfig, tune
 from p2gs.motion.directions import shared_axes
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
-from p2gs.motion.refine_motions import Judge, leave_false_minima, single_ways
+from p2gs.motion.refine_motions import Judge, single_ways
 from p2gs.motion.screw_polish import PolishConfig, photometric_cost
+from p2gs.motion.survey import leave_false_minima
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
 from p2gs.parts.askew import keep_shared, lay_axes

@@ -16,7 +16,8 @@ from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.models.stage import Stage, register_phase
 from p2gs.motion.discovery import Discovery, StateEvidence, discover, relabel
-from p2gs.motion.refine_motions import Judge, leave_false_minima
+from p2gs.motion.refine_motions import Judge
+from p2gs.motion.survey import leave_false_minima
 from p2gs.parts.askew import lay_axes
 from p2gs.parts.bodies import Surfaces, one_part_a_body
 from p2gs.parts.expand import expand

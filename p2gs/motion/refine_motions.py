@@ -15,7 +15,7 @@ from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.agreement import ShownPixels, kept_and_shown
 from p2gs.motion.discovery import Discovery, surface_energy
 from p2gs.motion.discovery.fields import Landing
-from p2gs.motion.screw_polish import PolishConfig, Side, allowed_step, apply_step, photometric_cost, polish
+from p2gs.motion.screw_polish import PolishConfig, Side, photometric_cost, polish
 from p2gs.ops import se3
 from p2gs.visibility.depth_stack import DepthStack
 
@@ -23,6 +23,7 @@ from p2gs.visibility.depth_stack import DepthStack
 # weighted 0.8) as landing in hidden space costs of landing in free space.
 HIDDEN = 0.8 * Landing.HIDDEN
 KNOWN = 64  # answers of a ``Judge`` that are kept
+LOOKED = 4  # motions of which a ``Judge`` keeps what counts: pixels' weights of all views
 
 
 def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor:
@@ -131,7 +132,8 @@ def explanation_cost(
 class Judge:
     """By what explanations are compared and refined: one number, the logarithm of the image loss (``explanation_cost``)
     plus what the surfaces say (``surface_energy``); lower is better. Adding 0.01 is an image loss higher by a
-    hundredth, or a hundredth of the moved surface left unexplained.
+    hundredth, or a hundredth of the moved surface left unexplained. Many are ranked by their own energies (a call), two
+    are compared by ``gain``.
 
     found: discovery's problem (None: photographs alone).  stacks: rendered depth of both states.  further: share of the
     image loss that a further part must save.
@@ -146,8 +148,9 @@ class Judge:
     backend: str
     device: torch.device | str = "cpu"
     further: float = 0.0
-    # the latest motions, what was asked of them, the answer
+    # the latest motions, what was asked of them, the answer; and the latest with what counts under them
     known: list[tuple] = field(default_factory=list, init=False)
+    looked: list[tuple] = field(default_factory=list, init=False)
 
     def _asked(self, motions: PartMotions, what: str, answer: Callable[[], float]) -> float:
         """``answer()``, or what it was the last time for the same motions."""
@@ -163,11 +166,32 @@ class Judge:
             self, config=replace(self.config, steps=steps, levels=self.config.levels[:1], level_starts=[0.0])
         )
 
-    def cost(self, motions: PartMotions) -> float:
-        """Image loss (``explanation_cost``)."""
+    def seen(self, motions: PartMotions) -> list[Seen]:
+        """What counts under these motions (``what_counts``)."""
+        for m, seen in self.looked:
+            if m is motions:
+                return seen
         options = {"backend": self.backend, "device": self.device}
+        seen = what_counts(self.states, motions, self.config, self.stacks, **options)
+        self.looked = [*self.looked[1 - LOOKED :], (motions, seen)]
+        return seen
+
+    def cost(self, motions: PartMotions, by: PartMotions | None = None) -> float:
+        """Image loss (``explanation_cost``) of what counts under the motions ``by`` (None: under these)."""
+        by = motions if by is None else by
+        options = {"seen": self.seen(by), "backend": self.backend, "device": self.device}
         ask = partial(explanation_cost, self.states, motions, self.views, self.config, self.stacks, **options)
-        return self._asked(motions, "cost", ask)
+        return ask() if by is not motions else self._asked(motions, "cost", ask)
+
+    def gain(self, tried: PartMotions, than: PartMotions) -> float:
+        """How much lower the energy of ``tried`` is than that of ``than``, on the same pixels: those that count under
+        either, averaged.
+
+        Which pixels count depends on the motions: a front that is carried into the body is hidden there, and its
+        pixels are no longer asked. By its own pixels each explanation would be judged by the data that it chose.
+        """
+        gained = sum(math.log(max(self.cost(than, by), 1e-9) / max(self.cost(tried, by), 1e-9)) for by in (tried, than))
+        return 0.5 * gained + self.surfaces(than) - self.surfaces(tried)
 
     def surfaces(self, motions: PartMotions) -> float:
         """What the surfaces say (``surface_energy``); nothing without ``found``."""
@@ -186,19 +210,18 @@ class Judge:
         return refine(self.states, motions, self.views, self.config, self.stacks, **options)
 
     def improved(self, motions: PartMotions) -> tuple[float, float, PartMotions]:
-        """Energy, image loss and motions: refined where that lowers the energy, else as they were. Where a part is
-        plain, photographs alone let it drift along itself, and surfaces know better."""
+        """Energy, image loss and motions: refined where that gains, else as they were. Where a part is plain,
+        photographs alone let it drift along itself, and surfaces know better."""
         tried = self.refine(motions)
-        return min(((*self(m), m) for m in (motions, tried)), key=lambda t: t[0])
+        best = tried if self.gain(tried, motions) > 0 else motions
+        return *self(best), best
 
     def no_worse(self, before: PartMotions, after: PartMotions) -> PartMotions:
-        """``after``, but for the parts that ``before`` explains better: each goes back alone where the energy falls."""
-        best = self(after)[0]
+        """``after``, but for the parts that ``before`` explains better: each goes back alone where that gains."""
         for k, kind in enumerate(before.types):
             tried = after.with_motion(k, kind, before.transforms[k])
-            energy = self(tried)[0]
-            if energy < best:
-                after, best = tried, energy
+            if self.gain(tried, after) > 0:
+                after = tried
         return after
 
 
@@ -224,72 +247,3 @@ def what_counts(
         kept, shown = kept_and_shown(states, motions, s, stacks, config)
         out.append(Seen(kept, ShownPixels(states[s], shown | ~kept, backend, device)))
     return out
-
-
-def survey(
-    states,
-    motions: PartMotions,
-    views,
-    config: PolishConfig,
-    stacks: list[DepthStack],
-    reach: list[float],
-    *,
-    backend: str,
-    device="cpu",
-) -> tuple[PartMotions, list[int]]:
-    """Lay each part, shifted within its own surface, where the images are explained best; the refinement goes on from
-    there.
-
-    A plain door shifted along itself still covers most of its place: a minimum of its own, centimetres from the true
-    one, that no descent leaves. reach: shifts tried to both sides of the part's two long directions (internal units).
-    Returns the motions and which of them moved.
-    """
-    # what counts is asked at every place anew: by the Gaussians that fit where the part is now, none is better
-    options = {"level": config.levels[0], "backend": backend, "device": device}
-    best = explanation_cost(states, motions, views, config, stacks, **options)
-    moved = []
-    for k in range(len(motions)):
-        points = states[0].gaussians.means[motions.labels[0] == k + 1].double().cpu()
-        if len(points) < 10:
-            continue
-        at = se3.apply(motions.transforms[k], points)
-        centre = at.mean(0)
-        radius = float((at - centre).square().sum(1).mean().sqrt())
-        found = None
-        for way in torch.linalg.svd(at - centre, full_matrices=False)[2][:2]:
-            for size in [sign * r for r in reach for sign in (1, -1)]:
-                shift = torch.cat([torch.zeros(3, dtype=torch.float64), way * size])
-                step = allowed_step(
-                    [motions.types[k]], motions.transforms[k : k + 1], centre[None], torch.tensor([radius]), shift[None]
-                )[0]
-                if float(step[3:].norm()) < 0.5 * abs(size):
-                    continue
-                T = apply_step(motions.transforms[k], centre, radius, step)
-                T = se3.project_revolute(T) if motions.types[k] == "revolute" else T
-                tried = motions.with_motion(k, motions.types[k], T)
-                cost = explanation_cost(states, tried, views, config, stacks, **options)
-                if cost < best:
-                    best, found = cost, tried
-        if found is not None:
-            motions = found
-            moved.append(k)
-    return motions, moved
-
-
-def leave_false_minima(judge: Judge, motions: PartMotions, reach: list[float]) -> tuple[PartMotions, list[int]]:
-    """Refined motions once more from where ``survey`` lays the parts, as long as the energy falls.
-
-    Returns them and which parts moved.
-    """
-    gone: list[int] = []
-    if judge.config.steps <= 0 or not reach or len(motions) == 0:
-        return motions, gone
-    options = {"backend": judge.backend, "device": judge.device}
-    while True:
-        surveyed, moved = survey(judge.states, motions, judge.views, judge.config, judge.stacks, reach, **options)
-        if not moved:
-            return motions, gone
-        value, _, surveyed = judge.improved(surveyed)
-        if value >= judge(motions)[0]:
-            return motions, gone
-        motions, gone = surveyed, sorted({*gone, *moved})

@@ -18,10 +18,10 @@ from p2gs.parts.settle import relabelled
 
 def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMotions, list[dict]]:
     """Each joint's axis that is askew to the directions of the object on the nearest of them, the rest refined, where
-    the energy rises by at most ``price`` (0, or no refinement: none is); with labels chosen anew where the judge has
-    discovery's surfaces.
+    that costs at most ``price`` of energy (``Judge.gain``; 0, or no refinement: none is); with labels chosen anew where
+    the judge has discovery's surfaces.
 
-    Returns the motions and what was tried: part, type, degrees off, energy before and after.
+    Returns the motions and what was tried: part, type, degrees off, what it gained.
     """
     log: list[dict] = []
     if price <= 0 or judge.config.steps <= 0:
@@ -31,7 +31,6 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
     for k, kind in enumerate(motions.types):
         if not bool(held[k].isnan().all()):
             continue  # laid with another part that has the same axis
-        lowest = judge(motions)[0]
         axis = axis_of(kind, motions.transforms[k])
         near = sorted((math.degrees(math.acos(min(1.0, abs(float(axis @ d))))), i) for i, d in enumerate(directions))
         shared = shared_axes(motions.transforms, motions.types)
@@ -40,9 +39,9 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
             continue
         axes = held.clone()
         axes[parts] = directions[near[0][1]]
-        value, laid = _best_laid(judge, motions, parts, axes)
-        log.append({"part": k, "type": kind, "degrees": near[0][0], "before": lowest, "after": value})
-        if value <= lowest + price:
+        gained, laid = _best_laid(judge, motions, parts, axes)
+        log.append({"part": k, "type": kind, "degrees": near[0][0], "gained": gained})
+        if gained >= -price:
             motions, held = laid, axes
     return motions, log
 
@@ -62,9 +61,8 @@ def keep_shared(judge: Judge, motions: PartMotions, axes: Tensor) -> PartMotions
 
 
 def _best_laid(judge: Judge, motions: PartMotions, parts: list[int], axes: Tensor) -> tuple[float, PartMotions]:
-    """Energy and motions with the axes of ``parts`` along ``axes[k]``: as they are turned onto them, refined, or
-    refined with labels chosen anew, whichever has the lowest energy. axes [K, 3]: directions that joints keep (NaN:
-    free)."""
+    """What it gains, and motions, with the axes of ``parts`` along ``axes[k]``: as they are turned onto them, refined,
+    or refined with labels chosen anew, whichever gains most. axes [K, 3]: directions that joints keep (NaN: free)."""
     laid = motions
     for k in parts:
         points = judge.states[0].gaussians.means[motions.labels[0] == k + 1].double().cpu()
@@ -74,4 +72,4 @@ def _best_laid(judge: Judge, motions: PartMotions, parts: list[int], axes: Tenso
     tried = [laid, judge.refine(laid, axes)]
     if judge.found is not None:
         tried.append(judge.refine(relabelled(judge.found, judge.states, tried[1]), axes))
-    return min(((judge(m)[0], m) for m in tried), key=lambda t: t[0])
+    return max(((judge.gain(m, motions), m) for m in tried), key=lambda t: t[0])

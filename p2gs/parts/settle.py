@@ -41,7 +41,7 @@ def reconsider(
     must as well (``judge.further``): what surfaces alone gain is junk. Returns the motions and what was tried.
     """
     found, states, log = judge.found, judge.states, []
-    lowest, cost = judge(motions)
+    _, cost = judge(motions)
     for _ in range(limit if len(motions) else 0):
         tries = {"exchanged": [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]}
         tries["crossed"] = _proposed(found, states, motions, places_changed(found, motions.transforms, motions.types))
@@ -56,15 +56,16 @@ def reconsider(
                 continue
             proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[: config.candidates]
             part, tried = min(proposed, key=lambda p: judge(p[1])[0])
-            value, reached, refined = judge.improved(tried)
+            _, reached, refined = judge.improved(tried)
+            gained = judge.gain(refined, motions)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
-            log[-1] |= {"proposed": judge(tried)[0] - lowest, "energy": value - lowest}
+            log[-1] |= {"proposed": -judge.gain(tried, motions), "energy": -gained}
             junk = lonely(refined, motions) and reached > cost * (1 - judge.further)
-            if value < (lowest if best is None else best[0]) and not junk:
-                best = (value, reached, refined)
+            if gained > (0 if best is None else best[0]) and not junk:
+                best = (gained, reached, refined)
         if best is None:
             break
-        lowest, cost, motions = best
+        _, cost, motions = best
     return motions, log
 
 

@@ -139,6 +139,9 @@ class Told:
     def __call__(self, motions):
         return self.slope * degrees_between(axis_of(motions.types[0], motions.transforms[0]), self.best), 1.0
 
+    def gain(self, tried, than):
+        return self(than)[0] - self(tried)[0]
+
     def refine(self, motions, axes=None):
         return motions
 

@@ -9,8 +9,9 @@ from tiny import hinge, look_at, slide
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.part_pull import facing
-from p2gs.motion.refine_motions import Judge, leave_false_minima, survey
+from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import PolishConfig
+from p2gs.motion.survey import leave_false_minima, survey
 from p2gs.ops import se3
 from p2gs.parts.islands import find_islands, pieces, settle_islands, settle_twin_islands
 from p2gs.types import GaussianTensors
@@ -127,8 +128,8 @@ def test_survey_leaves_a_false_minimum(kind, truth):
     )
     stacks = [None, None]  # not looked at: nothing is left out, all views count
     judge = Judge(SimpleNamespace(search=None), states, views, config, stacks, 0, "auto")
-    assert survey(states, motions, views, config, stacks, [], backend="auto")[1] == []
-    moved, which = survey(states, motions, views, config, stacks, [0.06, 0.12], backend="auto")
+    assert survey(judge, motions, [])[1] == []
+    moved, which = survey(judge, motions, [0.06, 0.12])
     error = [float((T[:3, 3] - truth[:3, 3]).norm()) for T in (off, moved.transforms[0])]
     assert which == [0] and error[1] < 0.5 * error[0]
     better, which = leave_false_minima(judge, motions, [0.06, 0.12])

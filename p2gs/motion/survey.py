@@ -1,0 +1,72 @@
+"""Parts that lie beside their place along their own surface: a plain door shifted along itself still covers most of its
+place, a minimum of its own, centimetres from the true one, that no descent leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Iterator
+
+import torch
+
+from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.refine_motions import Judge
+from p2gs.motion.screw_polish import allowed_step, apply_step
+from p2gs.ops import se3
+
+
+def survey(judge: Judge, motions: PartMotions, reach: list[float]) -> tuple[PartMotions, list[int]]:
+    """Lay each part, shifted within its own surface, where the smallest photographs are explained best (``Judge.gain``,
+    without surfaces); a refinement goes on from there.
+
+    reach: shifts tried to both sides of the part's two long directions (internal units). Returns the motions and which
+    of them moved.
+    """
+    glance = replace(judge.at_a_glance(judge.config.steps), found=None)
+    moved = []
+    for k in range(len(motions)):
+        laid = motions
+        for tried in _shifted(judge, motions, k, reach):
+            # by its own pixels first: that is one look instead of three
+            if glance.cost(tried) < glance.cost(laid) and glance.gain(tried, laid) > 0:
+                laid = tried
+        if laid is not motions:
+            motions = laid
+            moved.append(k)
+    return motions, moved
+
+
+def _shifted(judge: Judge, motions: PartMotions, k: int, reach: list[float]) -> Iterator[PartMotions]:
+    """The motions with part ``k`` shifted at the end along its two long directions, as far as its joint's type
+    lets it."""
+    points = judge.states[0].gaussians.means[motions.labels[0] == k + 1].double().cpu()
+    if len(points) < 10:
+        return
+    kind, T = motions.types[k], motions.transforms[k]
+    at = se3.apply(T, points)
+    centre = at.mean(0)
+    radius = float((at - centre).square().sum(1).mean().sqrt())
+    for way in torch.linalg.svd(at - centre, full_matrices=False)[2][:2]:
+        for size in [sign * r for r in reach for sign in (1, -1)]:
+            shift = torch.cat([torch.zeros(3, dtype=torch.float64), way * size])
+            step = allowed_step([kind], T[None], centre[None], torch.tensor([radius]), shift[None])[0]
+            if float(step[3:].norm()) < 0.5 * abs(size):
+                continue
+            at_end = apply_step(T, centre, radius, step)
+            yield motions.with_motion(k, kind, se3.project_revolute(at_end) if kind == "revolute" else at_end)
+
+
+def leave_false_minima(judge: Judge, motions: PartMotions, reach: list[float]) -> tuple[PartMotions, list[int]]:
+    """Refined motions once more from where ``survey`` lays the parts, as long as that gains.
+
+    Returns them and which parts moved.
+    """
+    gone: list[int] = []
+    while judge.config.steps > 0 and reach and len(motions):
+        surveyed, moved = survey(judge, motions, reach)
+        if not moved:
+            break
+        surveyed = judge.improved(surveyed)[2]
+        if judge.gain(surveyed, motions) <= 0:
+            break
+        motions, gone = surveyed, sorted({*gone, *moved})
+    return motions, gone
