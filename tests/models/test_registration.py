@@ -166,9 +166,9 @@ def test_what_moved_as_one_and_far_is_no_other_frame():
 
 
 def test_a_slide_along_the_base_is_no_other_frame():
-    """A textured panel slides along its normal, and along a plain one. Where nothing moved if the whole end did is the textured panel and
-    the plain one's middle, which cannot tell; the plain one's edges are only among the pixels where nothing moved if
-    it did not."""
+    """A textured panel slides along its normal, and along a plain one. Where nothing moved if the whole end did is the
+    textured panel and the plain one's middle, which cannot tell; the plain one's edges are only among the pixels where
+    nothing moved if it did not."""
     g, labels = textured_panels(1500)
     sideways = g.means[:, [1, 0, 2]] + torch.tensor([-0.5, 0.5, 0.0])
     plain = replace(
