@@ -82,6 +82,9 @@ def run_cell(cell: Cell, program: Sequence[str] = PROGRAM) -> Outcome:
     run.mkdir(parents=True, exist_ok=True)
     with locked(run) as lock:
         if is_done(cell):
+            # who carried it out may have been lost before, or told to be lost after, it noted that
+            if (record := read_record(run)).get("status") != "done":
+                note(cell, status="done", seconds=record.get("seconds", 0.0), error=None)
             return Outcome("done", 0.0)
         (run / "metrics.json").unlink(missing_ok=True)
         note(cell, status="running", seconds=0.0, error=None)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from p2gs.bench.cell import is_done, read_record, status
+from p2gs.bench.cell import is_done, note, read_record, status
 from p2gs.bench.live import Display
 from p2gs.bench.plan import read_bench
 from p2gs.bench.runner import run_bench
@@ -266,3 +266,22 @@ def test_a_run_that_ended_though_its_job_was_lost_is_not_run_twice(bench_file, p
     bench = read_bench([bench_file(ONE)])
     assert run(bench, program)[0] == {"done": 2}
     assert len(program.calls("fit")) == 2 and all(read_record(c.run)["status"] == "done" for c in bench.cells)
+
+
+@pytest.mark.parametrize("told", ["failed", "running"])
+def test_a_run_whose_job_was_lost_as_it_ended_is_noted_as_done(bench_file, program, monkeypatch, told):
+    """Its node went between the scores and the note, or was told to be gone before either."""
+    from p2gs.bench import runner
+
+    def ended(work):
+        def carry_out(cell):
+            work(cell)
+            note(cell, status=told, seconds=7.0, error=None)
+
+        return carry_out
+
+    monkeypatch.setattr(runner, "executor", lambda options, work: Losing(work, 1, before=ended(work)))
+    bench = read_bench([bench_file(ONE)])
+    assert run(bench, program)[0] == {"done": 2} and len(program.calls("fit")) == 2
+    records = [read_record(c.run) for c in bench.cells]
+    assert all((r["status"], r["seconds"], r["error"]) == ("done", 7.0, None) for r in records)
