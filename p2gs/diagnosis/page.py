@@ -161,9 +161,7 @@ def _discovery(d: dict) -> list[str]:
         rows = []
         for i, e in enumerate(found["explanations"]):
             tried = e.get("reductions", [])
-            gone = ", ".join(
-                f"{r['change']} {r['type']} ({r['cost_with']:.4f} to {r['cost_without']:.4f})" for r in tried
-            )
+            gone = ", ".join(f"{r['change']} {r['type']} (saved {100 * r['saved']:.1f} %)" for r in tried)
             mark = "chosen" if i == found["chosen"] else ""
             rows.append(
                 [
@@ -179,9 +177,9 @@ def _discovery(d: dict) -> list[str]:
                 [
                     "explanation",
                     "image loss",
-                    "energy",
+                    "energy above the chosen",
                     "",
-                    "parts; what was dropped or merged (image loss with it, without it)",
+                    "parts; what was dropped or merged (what it saved of the image loss)",
                 ],
                 rows,
             )

@@ -132,7 +132,7 @@ def _discovery(d: dict, say) -> None:
     chosen = found["explanations"][found["chosen"]] if found["chosen"] is not None else {}
     for r in chosen.get("reductions", []):
         what = {"merge": "was merged into a neighbour that moves alike", "drop": "was dropped"}[r["change"]]
-        why = f"image loss {r['cost_without']:.4f} without it, {r['cost_with']:.4f} with it; energy {r['energy']:+.3f}"
+        why = f"it saved {100 * r['saved']:.1f} % of the image loss; energy without it {r['energy']:+.3f}"
         say("discovery", f"A {r['type']} part {what}: {why}.", "note")
     for name, s in d["labels"].items():
         for k, share in enumerate(s["ambiguous_by_part"]):

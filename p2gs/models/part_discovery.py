@@ -113,20 +113,21 @@ def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say)
 
 
 def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
-    """The explanation of lowest energy, refined and without parts that it is better without; which it was, and what
-    each came to."""
-    refined, tried = [], []
+    """The explanation of lowest energy, refined and without parts that it is better without; which it was, and of each
+    the image loss and how much higher its energy is ("rank")."""
+    refined, tried, chosen = [], [], 0
     for number, explanation in enumerate(explanations):
         motions = _label_states(explanation, judge.states)
         if len(explanations) > 1:
             say(f"re-rendering explanation {number + 1} of {len(explanations)}")
         reductions: list[dict] = []
-        motions = simplify(judge, judge.improved(motions)[2], config.same_motion, reductions)
-        rank, cost = judge(motions)
-        tried.append({"types": motions.types, "cost": cost, "rank": rank, "reductions": reductions})
-        refined.append((rank, number, motions))
-    _, number, motions = min(refined, key=lambda t: t[:2])
-    return motions, {"explanation": number, "explanations": tried}
+        refined.append(simplify(judge, judge.improved(motions)[2], config.same_motion, reductions))
+        tried.append({"types": refined[-1].types, "cost": judge.cost(refined[-1]), "reductions": reductions})
+        if judge.gain(refined[-1], refined[chosen]) > 0:
+            chosen = number
+    for one, motions in zip(tried, refined, strict=True):
+        one["rank"] = judge.gain(refined[chosen], motions)
+    return refined[chosen], {"explanation": chosen, "explanations": tried}
 
 
 def _improved(

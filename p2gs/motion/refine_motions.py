@@ -183,15 +183,19 @@ class Judge:
         ask = partial(explanation_cost, self.states, motions, self.views, self.config, self.stacks, **options)
         return ask() if by is not motions else self._asked(motions, "cost", ask)
 
-    def gain(self, tried: PartMotions, than: PartMotions) -> float:
-        """How much lower the energy of ``tried`` is than that of ``than``, on the same pixels: those that count under
-        either, averaged.
+    def saved(self, tried: PartMotions, than: PartMotions) -> float:
+        """Logarithm of how much smaller the image loss of ``tried`` is than that of ``than``, on the same pixels: those
+        that count under either, averaged.
 
         Which pixels count depends on the motions: a front that is carried into the body is hidden there, and its
         pixels are no longer asked. By its own pixels each explanation would be judged by the data that it chose.
         """
-        gained = sum(math.log(max(self.cost(than, by), 1e-9) / max(self.cost(tried, by), 1e-9)) for by in (tried, than))
-        return 0.5 * gained + self.surfaces(than) - self.surfaces(tried)
+        ratios = [max(self.cost(than, by), 1e-9) / max(self.cost(tried, by), 1e-9) for by in (tried, than)]
+        return 0.5 * sum(map(math.log, ratios))
+
+    def gain(self, tried: PartMotions, than: PartMotions) -> float:
+        """How much lower the energy of ``tried`` is than that of ``than``: what it saved, and what surfaces say."""
+        return self.saved(tried, than) + self.surfaces(than) - self.surfaces(tried)
 
     def surfaces(self, motions: PartMotions) -> float:
         """What the surfaces say (``surface_energy``); nothing without ``found``."""

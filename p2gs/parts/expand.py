@@ -20,13 +20,10 @@ from p2gs.motion.refine_motions import Judge
 
 def expand(judge: Judge, motions: PartMotions) -> tuple[PartMotions, list[dict]]:
     """Motions and labels of lowest energy, after parts took the static surface or the whole object; what was taken."""
-    first, _ = judge(motions)
-    best, lowest, taken = motions, first, []
+    best, taken = motions, []
     for how, part, tried in expansions(motions):
-        value, _ = judge(tried)
-        if value < lowest:
-            taken = [{"change": how, "part": part, "energy": value - first}]
-            best, lowest = tried, value
+        if judge.gain(tried, best) > 0:
+            best, taken = tried, [{"change": how, "part": part, "energy": -judge.gain(tried, motions)}]
     return best, taken
 
 

@@ -24,29 +24,28 @@ def simplify(
     one must (``judge.further``).
 
     log: told of each part that goes: what was done, its index then, the label that its Gaussians got (numbered as
-    then), its type, image loss with and without it, what the energy gains.  final: motions are known for good. Then a
-    part may go to any that it touches, not to the static one alone; and none goes that shares its axis, for of a row's
-    shut drawers photographs alone know little.
+    then), its type, the share of the image loss that it saved, the change of the energy.  final: motions are known for
+    good. Then a part may go to any that it touches, not to the static one alone; and none goes that shares its axis,
+    for of a row's shut drawers photographs alone know little.
     """
-    lowest, cost = judge(motions)
     tried: set[tuple] = set()
     while len(motions):
         for change, reduced in _reductions(judge.states, motions, same_motion, final):
             if change in tried:
                 continue
             tried.add(change)
-            value, lower = judge(reduced)
+            saved, gained = judge.saved(reduced, motions), judge.gain(reduced, motions)
             alone = has_own_axis(motions, change[1]) if final else lonely(motions, reduced)
-            junk = change[0] != "merge" and alone and cost > lower * (1 - judge.further)
-            if junk or (value <= lowest and not final):
+            junk = change[0] != "merge" and alone and saved > math.log(1 - judge.further)
+            if junk or (gained >= 0 and not final):
                 break
         else:
             return motions
         if log is not None:
             done, part, into = change
             gone = {"change": done, "part": part, "into": into, "type": motions.types[part]}
-            log.append({**gone, "cost_with": cost, "cost_without": lower, "energy": value - lowest})
-        motions, lowest, cost = reduced, value, lower
+            log.append({**gone, "saved": 1 - math.exp(saved), "energy": -gained})
+        motions = reduced
         tried.clear()
     return motions
 
@@ -64,8 +63,7 @@ def drop_needless(
     fewer = simplify(replace(judge, further=penalty), motions, 0.0, gone, final=True)
     for count, part in zip(range(len(motions), 0, -1), gone, strict=False):
         labels = renumbering(count, part["part"], part["into"])[labels]
-        share = 100 * (1 - part["cost_with"] / part["cost_without"])
-        part["why"] = f"as a {part['type']} part of its own it saves {share:.1f} % of the image loss"
+        part["why"] = f"as a {part['type']} part of its own it saves {100 * part['saved']:.1f} % of the image loss"
     return judge.improved(fewer)[2] if gone else motions, labels, gone
 
 
@@ -159,16 +157,13 @@ def settle_types(judge: Judge, motions: PartMotions, below: float, penalty: floa
 
     penalty: share of the image loss by which a turn must win: it has two freedoms more.
     """
-    best = None
     for k in range(len(motions)):
         angle = math.degrees(float(so3.rotation_angle(motions.transforms[k, :3, :3])))
         if motions.types[k] != "revolute" or angle >= below:
             continue
-        best = judge.cost(motions) if best is None else best
         other = judge.refine(min(_as_slides(judge.states, motions, k), key=judge.cost))
-        found = judge.cost(other)
-        if found <= best * (1 + penalty):
-            motions, best = other, found
+        if judge.saved(other, motions) >= -math.log1p(penalty):
+            motions = other
     return motions
 
 

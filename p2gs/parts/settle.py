@@ -55,7 +55,7 @@ def reconsider(
             if not proposed:
                 continue
             proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[: config.candidates]
-            part, tried = min(proposed, key=lambda p: judge(p[1])[0])
+            part, tried = max(proposed, key=lambda p: judge.gain(p[1], motions))
             _, reached, refined = judge.improved(tried)
             gained = judge.gain(refined, motions)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
@@ -103,8 +103,7 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
     """
     found, states, rounds = judge.found, judge.states, []
     for number in range(config.rounds if len(motions) else 0):
-        lowest, cost = judge(motions)
-        best = None
+        cost, best = judge.cost(motions), None
         # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from
         # here on
         for name in ("kept", "anew"):
@@ -114,20 +113,13 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
             )
             if all(map(torch.equal, labels, motions.labels)):
                 continue
-            value, reached, tried = judge.improved(replace(tried, labels=labels))
-            rounds.append(
-                {
-                    "round": number,
-                    "labels": name,
-                    "islands": count,
-                    "before": cost,
-                    "after": reached,
-                    "energy": value - lowest,
-                }
-            )
-            if best is None or value < best[0]:
-                best = (value, tried)
-        if best is None or best[0] >= lowest:
+            _, reached, tried = judge.improved(replace(tried, labels=labels))
+            gained = judge.gain(tried, motions)
+            told = {"round": number, "labels": name, "islands": count, "before": cost, "after": reached}
+            rounds.append({**told, "energy": -gained})
+            if best is None or gained > best[0]:
+                best = (gained, tried)
+        if best is None or best[0] <= 0:
             break
         motions = settle_types(judge, best[1], config.compare_types_below, config.freedom_penalty)
     return motions, rounds

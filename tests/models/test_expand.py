@@ -1,5 +1,7 @@
 """A part may take the static surface or the whole object where the energy falls."""
 
+from types import SimpleNamespace
+
 import torch
 
 from p2gs.gaussians.handover import PartMotions
@@ -26,12 +28,16 @@ def test_expansions_are_each_parts_with_the_static_surface_and_with_everything()
     assert all(bool((own == 1).all()) for own in whole.labels)
 
 
-def test_the_expansion_of_lowest_energy_is_taken_and_none_that_is_higher():
-    def nothing_stands_still(m: PartMotions):
-        return float(sum((own == 0).sum() for own in m.labels)) + len(m), 1.0
+def judge_by(energy):
+    return SimpleNamespace(gain=lambda tried, than: energy(than) - energy(tried))
 
-    motions, log = expand(nothing_stands_still, two_parts())
+
+def test_the_expansion_of_lowest_energy_is_taken_and_none_that_is_higher():
+    def static(m: PartMotions) -> float:
+        return float(sum((own == 0).sum() for own in m.labels))
+
+    motions, log = expand(judge_by(lambda m: static(m) + len(m)), two_parts())
     assert len(motions) == 1 and log == [{"change": "took the whole object", "part": 0, "energy": -4.0}]
     start = two_parts()
-    motions, log = expand(lambda m: (-float(sum((own == 0).sum() for own in m.labels)), 1.0), start)
+    motions, log = expand(judge_by(lambda m: -static(m)), start)
     assert motions is start and log == []

@@ -133,6 +133,11 @@ class Told:
         cost = 9.0 if stands else (self.one if len(motions) == 1 else 1.0)
         return math.log(cost), cost
 
+    def saved(self, tried, than):
+        return self(than)[0] - self(tried)[0]
+
+    gain = saved
+
     def improved(self, motions):
         return (*self(motions), motions)
 
