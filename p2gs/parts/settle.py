@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -60,7 +61,7 @@ def reconsider(
             gained = judge.gain(refined, motions)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
             log[-1] |= {"proposed": -judge.gain(tried, motions), "energy": -gained}
-            junk = lonely(refined, motions) and reached > cost * (1 - judge.further)
+            junk = lonely(refined, motions) and judge.saved(refined, motions) < -math.log(1 - judge.further)
             if gained > (0 if best is None else best[0]) and not junk:
                 best = (gained, reached, refined)
         if best is None:
