@@ -56,12 +56,13 @@ def _shifted(judge: Judge, motions: PartMotions, k: int, reach: list[float]) -> 
 
 
 def leave_false_minima(judge: Judge, motions: PartMotions, reach: list[float]) -> tuple[PartMotions, list[int]]:
-    """Refined motions once more from where ``survey`` lays the parts, as long as that gains.
+    """Refined motions once more from where ``survey`` lays the parts, as long as that gains, and no oftener than there
+    are parts and shifts: gains of several steps do not add up, so they might lead round in a circle.
 
     Returns them and which parts moved.
     """
     gone: list[int] = []
-    while judge.config.steps > 0 and reach and len(motions):
+    for _ in range(len(motions) * len(reach) if judge.config.steps > 0 else 0):
         surveyed, moved = survey(judge, motions, reach)
         if not moved:
             break
