@@ -25,7 +25,7 @@ from p2gs.ops.knn import knn
 from p2gs.parts.askew import keep_shared, lay_axes
 from p2gs.parts.islands import settle_twin_islands
 from p2gs.parts.options import PartMotionsConfig
-from p2gs.parts.part_choices import drop_needless
+from p2gs.parts.part_choices import drop_needless, settle_types
 from p2gs.surface.contents import in_trays
 from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
 from p2gs.visibility.depth_stack import DepthStack
@@ -43,20 +43,21 @@ class FinishConfig:
     moves its points by less (internal units).
     part_penalty: share of the image loss that a part with an axis of its own must save against being static or one
     with a part that it touches, as in discovery (0: parts stay).
-    askew: share of the image loss that an axis which is askew to the object's directions must save against one
-    along them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less than this many
-    degrees is a slide. clean_neighbours: labels are the majority among this many neighbours at canonical time (0 =
+    askew: share of the image loss that an axis which is askew to the object's directions must save against one along
+    them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a
+    slide, and a turn by less is one unless it explains the photographs better by freedom_penalty (share of the image
+    loss), as in discovery. clean_neighbours: labels are the majority among this many neighbours at canonical time (0 =
     as learned). islands: pieces of a part smaller than this share of its largest go to what they touch (0 = off).
-    trays: views of a state by which drawers' trays are found, what is in or on which goes with the drawer (0 =
-    off). exports: simulator formats written at the end of a fit, with meshes and report (empty: neither; `p2gs
-    export` makes them later). extend_range: joint limits go on beyond the observed motion until the part touches
-    another one (half a turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians
-    whose majority exceeds the rest by less are shown as such in the diagnosis (0..1). complete: meshes have guesses
-    for what no camera saw (undersides, drawers' trays, hidden middles). closed: they are watertight, by a cut; a
-    sheet that hangs in an opening gets two sides (CD static of five objects 1.23 open, 1.38 closed). whole: the
-    mesh of the whole is its parts "joined", or a surface of its own, made "separate"ly from each state's views, as
-    PARIS, DTA and ArtGS have it. cluster: for meshes a moving part keeps only its largest DBSCAN cluster of
-    Gaussians, this the radius (input units; 0 = off; ArtGS cleans real scans so, with 0.05).
+    trays: views of a state by which drawers' trays are found, what is in or on which goes with the drawer (0 = off).
+    exports: simulator formats written at the end of a fit, with meshes and report (empty: neither; `p2gs export` makes
+    them later). extend_range: joint limits go on beyond the observed motion until the part touches another one (half a
+    turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians whose majority exceeds
+    the rest by less are shown as such in the diagnosis (0..1). complete: meshes have guesses for what no camera saw
+    (undersides, drawers' trays, hidden middles). closed: they are watertight, by a cut; a sheet that hangs in an
+    opening gets two sides (CD static of five objects 1.23 open, 1.38 closed). whole: the mesh of the whole is its parts
+    "joined", or a surface of its own, made "separate"ly from each state's views, as PARIS, DTA and ArtGS have it.
+    cluster: for meshes a moving part keeps only its largest DBSCAN cluster of Gaussians, this the radius (input units;
+    0 = off; ArtGS cleans real scans so, with 0.05).
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0))
@@ -67,6 +68,7 @@ class FinishConfig:
     part_penalty: float = PartMotionsConfig.part_penalty
     askew: float = 0.01
     prismatic_below: float = 5.0
+    freedom_penalty: float = PartMotionsConfig.freedom_penalty
     clean_neighbours: int = 8
     islands: float = 0.25
     trays: int = 16
@@ -235,6 +237,8 @@ def finish(
         judge = Judge(None, states, views, config.polish, stacks, **options)
         refined = judge.no_worse(motions, judge.refine(motions)) if config.polish.steps > 0 else motions
         refined, _ = leave_false_minima(judge, refined, config.survey)
+        if config.polish.steps > 0:
+            refined = settle_types(judge, refined, config.prismatic_below, config.freedom_penalty)
         refined, record.laid = lay_axes(judge, refined, config.askew)
         refined = keep_shared(judge, refined, axes)
         refined, labels, gone = drop_needless(judge, refined, labels, config.part_penalty)

@@ -210,3 +210,27 @@ def test_a_drawer_of_a_row_stays_though_photographs_hardly_need_it():
     askew[:3, 3] += torch.linalg.norm(further[:3, 3]) * 0.05 * torch.tensor([0.0, 0.0, 1.0])
     two = PartMotions(["prismatic"] * 2, torch.stack([slide(), askew]), torch.ones(2), [cut, cut], margins)
     assert len(drop_needless(Told(states, cut > 0, 0.99, PolishConfig()), two, cut, 0.02)[0]) == 1
+
+
+@pytest.mark.parametrize("true", ["prismatic", "revolute"])
+def test_a_turn_that_is_a_slide_to_the_photographs_is_one(true):
+    """A slide learned as a turn of two degrees about an axis nine away; a turn of half a radian stays one."""
+    way = slide()
+    axis = torch.linalg.cross(way[:3, 3], torch.tensor([0.0, 1.0, 0.0]).double())
+    axis = axis / axis.norm()
+    away = torch.linalg.cross(axis, way[:3, 3]) / math.radians(2)
+    states, labels, views = two_states(way if true == "prismatic" else hinge())
+    middle = states[0].gaussians.means[labels == 1].double().mean(0)
+    nearly = se3.from_screw(axis, middle + 0.5 * way[:3, 3] + away, math.radians(2))
+    T = nearly if true == "prismatic" else hinge()
+    assert float((se3.apply(nearly, middle[None])[0] - middle - way[:3, 3]).norm()) < 1e-3
+    learned = Articulation(
+        states[0].gaussians, torch.nn.functional.one_hot(labels, 2).float(), ["revolute"], T[None], torch.ones(1), 0.0
+    )
+    config = FinishConfig(
+        polish=PolishConfig(steps=20, levels=[64], level_starts=[0.0]), clean_neighbours=0, survey=[], askew=0.0
+    )
+    twin, _, _ = finish(learned, states, views, config, Similarity(), seed=0, backend="auto")
+    assert twin.parts[1].joint.type == true
+    if true == "prismatic":
+        assert twin.parts[1].joint.motion == pytest.approx(float(way[:3, 3].norm()), abs=5e-3)
