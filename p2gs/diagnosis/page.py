@@ -14,7 +14,7 @@ import numpy as np
 from p2gs.data.box import INTERNAL_DIAGONAL
 from p2gs.diagnosis.measures import StageResults, diagnose
 from p2gs.diagnosis.pictures import diagnostic_strips
-from p2gs.diagnosis.verdict import LIMITS, STAGES, lost_at, verdicts
+from p2gs.diagnosis.verdict import LIMITS, STAGES, lost_at, told_saved, verdicts
 from p2gs.export.pages.report import read_scalars, table
 from p2gs.export.pages.report_view import chip
 from p2gs.types import ArticulatedObject, UserError
@@ -161,7 +161,7 @@ def _discovery(d: dict) -> list[str]:
         rows = []
         for i, e in enumerate(found["explanations"]):
             tried = e.get("reductions", [])
-            gone = ", ".join(f"{r['change']} {r['type']} (saved {100 * r['saved']:.1f} %)" for r in tried)
+            gone = ", ".join(f"{r['change']} {r['type']} ({told_saved(r)})" for r in tried)
             mark = "chosen" if i == found["chosen"] else ""
             rows.append(
                 [

@@ -132,7 +132,7 @@ def _discovery(d: dict, say) -> None:
     chosen = found["explanations"][found["chosen"]] if found["chosen"] is not None else {}
     for r in chosen.get("reductions", []):
         what = {"merge": "was merged into a neighbour that moves alike", "drop": "was dropped"}[r["change"]]
-        why = f"it saved {100 * r['saved']:.1f} % of the image loss; energy without it {r['energy']:+.3f}"
+        why = f"it {told_saved(r)} of the image loss; energy without it {r['energy']:+.3f}"
         say("discovery", f"A {r['type']} part {what}: {why}.", "note")
     for name, s in d["labels"].items():
         for k, share in enumerate(s["ambiguous_by_part"]):
@@ -142,6 +142,13 @@ def _discovery(d: dict, say) -> None:
                     f"Part {k}: {share:.0%} of its Gaussians in the {name} state have unclear labels.",
                     "note",
                 )
+
+
+def told_saved(gone: dict) -> str:
+    """What a part that discovery dropped or merged saved. Discoveries of before 95d784a, which ``--keep_stale`` keeps,
+    have two image losses in its place."""
+    share = gone["saved"] if "saved" in gone else 1 - gone["cost_with"] / gone["cost_without"]
+    return f"saved {100 * share:.1f} %"
 
 
 def _static(d: dict, say) -> None:

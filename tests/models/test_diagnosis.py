@@ -43,7 +43,10 @@ def small_run(found=None, polish_steps=0):
                 "types": ["revolute"],
                 "cost": 0.1,
                 "rank": 0.1,
-                "reductions": [{"change": "drop", "type": "prismatic", "saved": 0.001, "energy": -0.029}],
+                "reductions": [
+                    {"change": "drop", "type": "prismatic", "saved": 0.001, "energy": -0.029},
+                    {"change": "drop", "type": "revolute", "cost_with": 0.09, "cost_without": 0.1, "energy": -0.01},
+                ],
             }
         ],
         "evidence": [labels.to(torch.int8)] * 2,
@@ -80,6 +83,7 @@ def test_a_right_run_has_no_warning(right):
     assert texts(right) == [] and lost_at(verdicts(right, 1.0)) is None
     notes = [v["text"] for v in verdicts(right, 1.0)]
     assert any(t.startswith("A prismatic part was dropped: it saved 0.1 % of the image loss") for t in notes)
+    assert any(t.startswith("A revolute part was dropped: it saved 10.0 % of the image loss") for t in notes)
     (joint,) = right["joints"]
     assert joint["confidence"] > 0.7 and set(joint["confidence_by_stage"]) == {"discovery", "articulation", "finish"}
     assert right["single_state"]["start"]["psnr"] > 30 and right["single_state"]["start"]["alpha_iou"] > 0.95
