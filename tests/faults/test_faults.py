@@ -12,7 +12,7 @@ from collections import Counter
 from functools import partial
 
 import pytest
-from whole_runs import Fit, fit, make_whole
+from whole_runs import CPU, Fit, fit, make_whole
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(0)]
 KILLS = int(os.environ.get("P2GS_KILLS", "100"))
@@ -31,11 +31,12 @@ def one_sentence(ended, code, *texts):
     assert all(text in ended.said.strip().splitlines()[-1] for text in texts), ended.said
 
 
-def test_killed_at_random_moments(whole, tmp_path):
-    rng, at, runs = random.Random(KILLS), Counter(), 0
-    while sum(at.values()) < KILLS:
+def killed(whole, tmp_path, kills: int):
+    """Runs that are killed ``kills`` times in all and go on end in the same bytes."""
+    rng, at, runs = random.Random(kills), Counter(), 0
+    while sum(at.values()) < kills:
         run, runs = tmp_path / f"run_{runs}", runs + 1
-        for _ in range(min(KILLS_A_RUN, KILLS - sum(at.values()))):
+        for _ in range(min(KILLS_A_RUN, kills - sum(at.values()))):
             with Fit(whole.config, run) as one:
                 if one.after(rng.randrange(whole.lines), rng.uniform(0, whole.gap)):
                     one.process.send_signal(signal.SIGKILL)
@@ -43,6 +44,14 @@ def test_killed_at_random_moments(whole, tmp_path):
         whole.same(run, fit(whole.config, run))
         shutil.rmtree(run)
     print(f"\n{sum(at.values())} kills in {runs} runs: {dict(at)}")
+
+
+def test_killed_at_random_moments(whole, tmp_path):
+    killed(whole, tmp_path, KILLS)
+
+
+def test_killed_at_random_moments_with_the_cpu_preset(tmp_path):
+    killed(make_whole(tmp_path, CPU), tmp_path, max(KILLS // 10, 1))
 
 
 @pytest.mark.parametrize("seed", range(6))

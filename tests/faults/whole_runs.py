@@ -37,6 +37,12 @@ phases:
 callbacks: {{checkpoint: {{every: 7}}, progress: {{plain_seconds: 0.2}}}}
 """
 
+# What users run, on the demo's object: minutes a run.
+CPU = """
+include: [preset/cpu.yaml]
+data: {{format: synthetic, root: {root}, kind: demo, size: 200, train_views: 32, test_views: 2, depth: never}}
+"""
+
 
 @dataclass
 class Ended:
@@ -137,9 +143,9 @@ class Whole:
         assert outputs(run) == self.outputs, f"{run} differs from the undisturbed run"
 
 
-def make_whole(folder: Path) -> Whole:
-    config = folder / "smoke.yaml"
-    config.write_text(SMOKE.format(root=folder / "scene"))
+def make_whole(folder: Path, text: str = SMOKE) -> Whole:
+    config = folder / "fit.yaml"
+    config.write_text(text.format(root=folder / "scene"))
     fit(config, folder / "first", "--only", "single_state")  # generates the scene, which would count into the gap
     began = time.monotonic()
     with Fit(config, folder / "whole") as one:
