@@ -31,7 +31,7 @@ from p2gs.motion.discovery.labels import Graph
 from p2gs.motion.discovery.problem import build_problem
 from p2gs.motion.discovery.search import Search
 from p2gs.motion.joint_confidence import JointEvidence, common_level, features, nudges, state_depth
-from p2gs.motion.refine_motions import refine, single_ways
+from p2gs.motion.refine_motions import Judge, refine, single_ways
 from p2gs.ops import se3
 from p2gs.parts.settle import label_gaussians
 from p2gs.visibility.evidence import gather_evidence
@@ -105,7 +105,7 @@ def measured(
         motions = refine(states, motions, views, config.polish, stacks, seed=case.cfg.seed, **options)
     record = FinishRecord(labels, [m.sign() for m in margin], motions.transforms, motions.transforms)
     record.polish = single_ways(states, motions, views, config.polish, stacks, seed=case.cfg.seed, **options)
-    measure(record, states, types, views, stacks, level, **options)
+    measure(record, Judge(None, states, views, config.polish, stacks, case.cfg.seed, **options), motions, level)
     return judged(case, motions.transforms, types, [e.as_dict() for e in record.evidence])
 
 

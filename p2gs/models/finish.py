@@ -25,7 +25,7 @@ from p2gs.ops.knn import knn
 from p2gs.parts.askew import keep_shared, lay_axes
 from p2gs.parts.islands import settle_twin_islands
 from p2gs.parts.options import PartMotionsConfig
-from p2gs.parts.part_choices import drop_needless, settle_types
+from p2gs.parts.part_choices import drop_needless, own_shares, settle_types
 from p2gs.surface.contents import in_trays
 from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
 from p2gs.visibility.depth_stack import DepthStack
@@ -41,8 +41,8 @@ class FinishConfig:
     its own surface that are tried after it (internal units; [] = none). tune: then the Gaussians once more, with the
     screws frozen. min_mass: a slot with a smaller share of the solid Gaussians vanishes. min_motion: likewise one that
     moves its points by less (internal units).
-    part_penalty: share of the image loss that a part with an axis of its own must save against being static or one
-    with a part that it touches, as in discovery (0: parts stay).
+    part_penalty: share of the image loss in its own pixels that a part with an axis of its own must save against being
+    static or one with a part that it touches, as in discovery (0: parts stay).
     askew: share of the image loss that an axis which is askew to the object's directions must save against one along
     them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a
     slide, and a turn by less is one unless it explains the photographs better by freedom_penalty (share of the image
@@ -249,7 +249,7 @@ def finish(
         record.after = transforms = refined.transforms
     if len(types):
         record.polish = single_ways(states, refined, views, config.polish, stacks, **options)
-        measure(record, states, types, views, stacks, level, backend, device)
+        measure(record, judge, refined, level)
     options["backend"] = twin_backend or backend
     gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
     twin = assemble(gaussians, labels, types, transforms, time, similarity, [e.confidence for e in record.evidence])
@@ -308,18 +308,10 @@ def assemble(
     return ArticulatedObject(g, labels, parts, time, similarity)
 
 
-def measure(
-    record: FinishRecord,
-    states: list[StateGaussians],
-    types: list[str],
-    views: dict[int, TrainingViews],
-    stacks: list[DepthStack],
-    level: int,
-    backend: str,
-    device,
-) -> None:
-    """Fill in ``costs`` and ``evidence``. stacks: rendered depth of both states; level: image size."""
-    options = {"level": level, "backend": backend, "device": device}
+def measure(record: FinishRecord, judge: Judge, motions: PartMotions, level: int) -> None:
+    """Fill in ``costs`` and ``evidence`` of the final motions. level: image size."""
+    states, views = judge.states, judge.views
+    options = {"level": level, "backend": judge.backend, "device": judge.device}
     for name, T in (("before", record.before), ("after", record.after)):
         ways = (T, se3.inverse(T))
         record.costs[name] = [
@@ -330,7 +322,8 @@ def measure(
     known = [m >= 0 for m in record.margin]
     shown = [replace(s, gaussians=s.gaussians[k]) for s, k in zip(states, known, strict=True)]
     labels = [x[k] for x, k in zip(record.labels, known, strict=True)]
-    record.evidence = measure_joints(shown, labels, record.after, types, views, stacks, both=both, **options)
+    found = measure_joints(shown, labels, record.after, motions.types, views, judge.stacks, both=both, **options)
+    record.evidence = [replace(e, saved=own) for e, own in zip(found, own_shares(judge, motions), strict=True)]
 
 
 def make_joint(kind: str, transform: Tensor, centre: Tensor) -> Joint:

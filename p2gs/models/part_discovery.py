@@ -23,6 +23,7 @@ from p2gs.parts.bodies import Surfaces, one_part_a_body
 from p2gs.parts.expand import expand
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import join_twins, settle_types, simplify
+from p2gs.parts.seek import seek
 from p2gs.parts.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
 from p2gs.parts.slots import merge_to
 from p2gs.types import TwoStateScene, UserError
@@ -135,19 +136,31 @@ def _improved(
 ) -> tuple[PartMotions, dict]:
     """Types settled, bodies told apart, false minima left, each part reconsidered; what was done."""
     motions = settle_types(judge, motions, config.compare_types_below, config.freedom_penalty)
-    motions, bodies = one_part_a_body(
-        judge.states, motions, labelled_surfaces(judge.found, motions.transforms, motions.types), limit
-    )
-    if bodies:
-        motions = judge.improved(motions)[2]
-    changed: list[dict] = [{"change": "one part a body", **b} for b in bodies]
+    motions, changed = _bodies(judge, motions, limit)
     motions, shifted = leave_false_minima(judge, motions, config.survey)
     if config.reconsider:
         say("reconsidering each part")
         motions, reconsidered = reconsider(judge, motions, limit, config)
         changed += reconsidered
         motions = simplify(judge, motions, config.same_motion, changed)
+    if config.seek:
+        say("looking for what no part explains")
+        known = len(motions)
+        motions, sought = seek(judge, motions, limit, config)
+        changed += sought
+        if len(motions) > known:
+            motions, bodies = _bodies(judge, motions, limit)
+            changed += bodies
     return motions, {"shifted": shifted, "reconsidered": changed}
+
+
+def _bodies(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMotions, list[dict]]:
+    """Parts that are several bodies told apart, and refined where there were any; what was done."""
+    surfaces = labelled_surfaces(judge.found, motions.transforms, motions.types)
+    motions, bodies = one_part_a_body(judge.states, motions, surfaces, limit)
+    if bodies:
+        motions = judge.improved(motions)[2]
+    return motions, [{"change": "one part a body", **b} for b in bodies]
 
 
 def labelled_surfaces(found: Discovery, transforms: Tensor, types: list[str]) -> Surfaces:

@@ -46,7 +46,8 @@ class JointEvidence:
     0 at a minimum.
     disagreement: mean distance between the points where the start -> end and the end -> start refinement put the part
     (internal units; None where there was no such refinement).  views: how many photographs showed enough of the part to
-    be measured.
+    be measured.  saved: share of the image loss that the part saves in its own pixels (``own_shares``; None: not
+    asked).
     """
 
     coverage: float
@@ -56,6 +57,7 @@ class JointEvidence:
     fall: float
     disagreement: float | None
     views: int
+    saved: float | None = None
 
     @property
     def confidence(self) -> float:

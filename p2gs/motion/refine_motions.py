@@ -13,6 +13,7 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.agreement import ShownPixels, kept_and_shown
+from p2gs.motion.difference import image_losses
 from p2gs.motion.discovery import Discovery, surface_energy
 from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.screw_polish import PolishConfig, Side, photometric_cost, polish
@@ -136,7 +137,7 @@ class Judge:
     are compared by ``gain``.
 
     found: discovery's problem (None: photographs alone).  stacks: rendered depth of both states.  further: share of the
-    image loss that a further part must save.
+    image loss in its own pixels that a further part must save (``own_share``).
     """
 
     found: Discovery | None
@@ -192,6 +193,28 @@ class Judge:
         """
         ratios = [max(self.cost(than, by), 1e-9) / max(self.cost(tried, by), 1e-9) for by in (tried, than)]
         return 0.5 * sum(map(math.log, ratios))
+
+    def own_share(self, tried: PartMotions, than: PartMotions) -> float:
+        """Share of the image loss that ``tried`` saves against ``than`` (-inf..1), each pixel weighted by how far their
+        pictures differ there and by how much it counts under either, averaged; 0 where they nowhere differ.
+
+        Of the whole image a small part saves little however right it is; this is alike for parts of any size.
+        """
+        lost = torch.zeros(2, dtype=torch.float64)
+        for s in (0, 1):
+            ways = [se3.inverse(m.transforms) if s else m.transforms for m in (tried, than)]
+            for seen in (self.seen(tried), self.seen(than)):
+                drawn = [torch.where(seen[s].kept, m.labels[s], -1) for m in (tried, than)]
+                lost += image_losses(
+                    self.states[s],
+                    list(zip(drawn, ways, strict=True)),
+                    self.views[1 - s],
+                    self.config.ssim_lambda,
+                    seen[1 - s].pixels,
+                    self.backend,
+                    self.device,
+                )
+        return float(1 - lost[0] / lost[1]) if float(lost[1]) > 0 else 0.0
 
     def gain(self, tried: PartMotions, than: PartMotions) -> float:
         """How much lower the energy of ``tried`` is than that of ``than``: what it saved, and what surfaces say."""

@@ -20,6 +20,8 @@ from p2gs.ops.components import TOUCH, components
 from p2gs.visibility.depth_stack import DepthStack, classify
 
 FEWEST = 30  # points of a body in each state: a plate of 5 x 6 of them
+# points, too, of one of several bodies of a small part, and least share of the points of its largest
+SMALL, ALIKE = 12, 0.5
 BRIDGES = 256  # lines between two pieces that are tried, from the shortest up
 STOPS = 9  # points looked at on each line
 
@@ -65,16 +67,20 @@ def bridged(
 
 def bodies_of(surfaces: Surfaces, part: int, motion: Tensor) -> list[list[Tensor]]:
     """The bodies that a part consists of, the largest first, each as its rows of either state's points; none of fewer
-    than ``FEWEST`` in a state (what one state alone shows may be anything).  motion [4, 4] start -> end.
+    than ``FEWEST`` in a state, or than ``SMALL`` where the largest is not twice as large (what one state alone shows
+    may be anything).  motion [4, 4] start -> end.
     """
     rows = [(of == part + 1).nonzero().squeeze(1) for of in surfaces.labels]
-    if min(map(len, rows)) < 2 * FEWEST:
+    if min(map(len, rows)) < 2 * SMALL:
         return [rows]
     places = [surfaces.points[s][rows[s]].double() for s in (0, 1)]
     points = torch.cat([places[0], se3.apply(se3.inverse(motion), places[1])])
     piece, split = components(points, TOUCH * surfaces.spacing), len(rows[0])
     sizes = [(int((piece[:split] == c).sum()), int((piece[split:] == c).sum())) for c in range(piece.max() + 1)]
-    large = sorted((c for c, n in enumerate(sizes) if min(n) >= FEWEST), key=lambda c: -sum(sizes[c]))
+    most = [max(n[s] for n in sizes) for s in (0, 1)]
+    enough = [min(FEWEST, max(SMALL, ALIKE * n)) for n in most]
+    large = [c for c, n in enumerate(sizes) if n[0] >= enough[0] and n[1] >= enough[1]]
+    large.sort(key=lambda c: -sum(sizes[c]))
     if len(large) < 2:
         return [rows]
     rest = surfaces.points[0][surfaces.labels[0] != part + 1]

@@ -20,13 +20,13 @@ class PartMotionsConfig:
     decide; freedom_penalty: relative image loss by which a turn must win against a slide.
     same_motion: two touching parts whose motions carry them this near to each other (internal units) are tried as one.
     survey: shifts within its own surface tried for each part (internal units; [] = none).
-    part_penalty: share of the image loss that each part with an axis of its own must save, or goes, and that one
-    which is added or halved must save when parts are reconsidered. On ten objects junk saved at most 1.6 %, true
-    parts 6 % and more, the second of two stacked doors 3 %.
+    part_penalty: share of the image loss in its own pixels that each part with an axis of its own must save, or goes,
+    and that one which is added or halved must save when parts are reconsidered (``Judge.own_share``).
     islands: pieces of a part smaller than this share of its largest piece, and apart from it, go to the part whose
     surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.
     reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched
     again amid the others, refined, and taken where the energy falls.
+    seek: surface that no motion explains is then searched by itself for further parts, however small.
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to
     nothing of it.
     askew: share of the image loss that an axis must save which is askew to the directions that the object has, against
@@ -40,11 +40,12 @@ class PartMotionsConfig:
     compare_types_below: float = 45.0
     freedom_penalty: float = 0.002
     same_motion: float = 0.04
-    part_penalty: float = 0.02
+    part_penalty: float = 0.15
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     islands: float = 0.25
     rounds: int = 2
     reconsider: bool = True
+    seek: bool = True
     min_confidence: float = 0.02
     askew: float = 0.01
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)

@@ -20,13 +20,13 @@ def simplify(
     judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None, final: bool = False
 ) -> PartMotions:
     """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the
-    energy does not rise; drop a part, too, that has an axis of its own and saves less of the image loss than a further
-    one must (``judge.further``).
+    energy does not rise; drop a part, too, that has an axis of its own and saves less of the image loss in its own
+    pixels (``Judge.own_share``) than a further one must (``judge.further``).
 
     log: told of each part that goes: what was done, its index then, the label that its Gaussians got (numbered as
-    then), its type, the share of the image loss that it saved, the change of the energy.  final: motions are known for
-    good. Then a part may go to any that it touches, not to the static one alone; and none goes that shares its axis,
-    for of a row's shut drawers photographs alone know little.
+    then), its type, the share of the image loss that it saved in its own pixels, the change of the energy.  final:
+    motions are known for good. Then a part may go to any that it touches, not to the static one alone; and none goes
+    that shares its axis, for of a row's shut drawers photographs alone know little.
     """
     tried: set[tuple] = set()
     while len(motions):
@@ -34,9 +34,9 @@ def simplify(
             if change in tried:
                 continue
             tried.add(change)
-            saved, gained = judge.saved(reduced, motions), judge.gain(reduced, motions)
+            saved, gained = judge.own_share(motions, reduced), judge.gain(reduced, motions)
             alone = has_own_axis(motions, change[1]) if final else lonely(motions, reduced)
-            junk = change[0] != "merge" and alone and saved > math.log(1 - judge.further)
+            junk = change[0] != "merge" and alone and saved < judge.further
             if junk or (gained >= 0 and not final):
                 break
         else:
@@ -44,7 +44,7 @@ def simplify(
         if log is not None:
             done, part, into = change
             gone = {"change": done, "part": part, "into": into, "type": motions.types[part]}
-            log.append({**gone, "saved": 1 - math.exp(saved), "energy": -gained})
+            log.append({**gone, "saved": saved, "energy": -gained})
         motions = reduced
         tried.clear()
     return motions
@@ -53,18 +53,29 @@ def simplify(
 def drop_needless(
     judge: Judge, motions: PartMotions, labels: Tensor, penalty: float
 ) -> tuple[PartMotions, Tensor, list[dict]]:
-    """The motions and the twin's labels [N] without parts that save less than ``penalty`` of the image loss now that
-    all motions are known (``simplify``; 0, or no refinement: all stay), refined again where any went; and those that
-    went, each with a sentence ``why``. Where discovery saw a part's motion half a degree wrong, it may have taken
-    another to make up for it."""
+    """The motions and the twin's labels [N] without parts that save less than ``penalty`` of the image loss in their
+    own pixels now that all motions are known (``simplify``; 0, or no refinement: all stay), refined again where any
+    went; and those that went, each with a sentence ``why``. Where discovery saw a part's motion half a degree wrong, it
+    may have taken another to make up for it."""
     gone: list[dict] = []
     if penalty <= 0 or judge.config.steps <= 0:
         return motions, labels, gone
     fewer = simplify(replace(judge, further=penalty), motions, 0.0, gone, final=True)
     for count, part in zip(range(len(motions), 0, -1), gone, strict=False):
         labels = renumbering(count, part["part"], part["into"])[labels]
-        part["why"] = f"as a {part['type']} part of its own it saves {100 * part['saved']:.1f} % of the image loss"
+        part["why"] = (
+            f"as a {part['type']} part of its own it saves {100 * part['saved']:.0f} % of the loss in its own pixels"
+        )
     return judge.improved(fewer)[2] if gone else motions, labels, gone
+
+
+def own_shares(judge: Judge, motions: PartMotions) -> list[float]:
+    """Of each part, what it saves of the image loss in its own pixels (``Judge.own_share``) against being static or one
+    with a part that it touches, whichever explains them best."""
+    out = [1.0] * len(motions)
+    for (_, part, _), fewer in _reductions(judge.states, motions, 0.0, joins=True):
+        out[part] = min(out[part], judge.own_share(motions, fewer))
+    return out
 
 
 def lonely(more: PartMotions, fewer: PartMotions) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import torch
@@ -39,7 +38,8 @@ def reconsider(
     explain most (``in_two``), and the amounts of all bodies that slid one way (``in_rows``). Under each proposal
     every surfel chooses its part anew, and with the ``candidates`` of each kind that surfaces like best the states
     are re-rendered. The best of each kind is refined, and the energy must fall; with a further part the image loss
-    must as well (``judge.further``): what surfaces alone gain is junk. Returns the motions and what was tried.
+    must as well, in its own pixels (``Judge.own_share``): what surfaces alone gain is junk. Returns the motions and
+    what was tried.
     """
     found, states, log = judge.found, judge.states, []
     _, cost = judge(motions)
@@ -61,8 +61,8 @@ def reconsider(
             gained = judge.gain(refined, motions)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
             log[-1] |= {"proposed": -judge.gain(tried, motions), "energy": -gained}
-            junk = lonely(refined, motions) and judge.saved(refined, motions) < -math.log(1 - judge.further)
-            if gained > (0 if best is None else best[0]) and not junk:
+            better = gained > (0 if best is None else best[0])
+            if better and not (lonely(refined, motions) and judge.own_share(refined, motions) < judge.further):
                 best = (gained, reached, refined)
         if best is None:
             break

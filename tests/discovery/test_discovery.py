@@ -7,8 +7,18 @@ import pytest
 import torch
 from boxes import PLAIN, both, box, door, drawer, shell
 
-from p2gs.data.generated.articulated import SyntheticObject, SyntheticPart, prismatic
-from p2gs.motion.discovery import DiscoveryConfig, StateEvidence, discover, instead_of, places_changed
+from p2gs.data.generated.articulated import SyntheticObject, SyntheticPart, prismatic, revolute
+from p2gs.motion.discovery import (
+    DiscoveryConfig,
+    StateEvidence,
+    as_motions,
+    discover,
+    instead_of,
+    left_over,
+    places_changed,
+)
+from p2gs.motion.discovery.leftover import as_turns
+from p2gs.ops import se3
 from p2gs.types import UserError
 
 SMALL = DiscoveryConfig(surfels=4000, samples=250, candidates=2)
@@ -94,6 +104,38 @@ def test_a_wrong_motion_amid_right_ones_is_asked_for_anew(door_and_drawer):
     # the part's own motion is no other motion
     T[drawer_k], types[drawer_k] = truth, "prismatic"
     assert all(float((A - truth).abs().max()) > 0.03 for A, _ in instead_of(found, T, types, drawer_k))
+
+
+def test_a_small_part_amid_a_large_one_is_found_by_itself():
+    """A latch of a twentieth of the moved surface, with the door's motion known; nothing where all is explained."""
+    latch = SyntheticPart(
+        "latch",
+        (box((-0.5, 0.6, 0.1), (-0.2, 0.66, 0.4), PLAIN), box((-0.5, 0.66, 0.1), (-0.4, 0.75, 0.4), PLAIN)),
+        revolute((0, 0, 1.0), (-0.5, 0.6, 0.26), 0, 40),
+    )
+    obj = shell(door(-0.6, 0.6, -0.6, 0.6, True, 60), latch)
+    views, _ = both(obj, size=200)
+    found = discover(*views, 2, SMALL, seed=0)
+    true = [torch.as_tensor(p.pose(1.0) @ np.linalg.inv(p.pose(0.0))) for p in obj.parts[1:]]
+    proposed = left_over(found, true[0][None], ["revolute"])
+    points = torch.from_numpy(np.stack([q.pose[:3, 3] for q in obj.parts[2].primitives]))
+    gaps = [float((se3.apply(T, points) - se3.apply(true[1], points)).norm(dim=1).mean()) for T, _ in proposed]
+    assert min(gaps) < 0.02
+    assert left_over(found, torch.stack(true), ["revolute"] * 2) == []
+
+
+def test_turns_take_a_slides_middle_to_the_same_place(door_and_drawer):
+    *_, found = door_and_drawer
+    problem = found.problem
+    drawer = next(i for i, m in enumerate(found.motions) if m.type == "prismatic")
+    slide = as_motions(found.motions[drawer].transform[None], ["prismatic"])
+    turns = as_turns(problem, slide, torch.eye(3))
+    pay = problem.pay(slide)[0][0][0]
+    middle = (problem.surfels[0].points[problem.samples[0]] * pay[:, None]).sum(0) / pay.sum()
+    across = slide.axis - turns.axis * (turns.axis @ slide.axis[0])[:, None]
+    assert turns.turn.all() and len(turns) > 60
+    gone = turns.apply(middle[None])[:, 0] - middle
+    assert torch.allclose(gone, across * slide.amount, atol=1e-4)
 
 
 def test_two_like_parts_taken_for_one_another_change_back():

@@ -69,6 +69,13 @@ def test_what_stands_between_parts_them():
     assert len(bodies_of(surfaces(torch.cat([TWO, wall]), labels, nowhere), 0, slide())) == 2
 
 
+def test_two_like_bodies_of_a_small_part_are_two():
+    """Latches of a box: a dozen points each."""
+    small = torch.cat([plate(0.0)[: FEWEST - 5], plate(0.4)[: FEWEST - 8]])
+    ones = torch.ones(len(small), dtype=torch.long)
+    assert [len(r[0]) for r in bodies_of(surfaces(small, ones, between), 0, slide())] == [FEWEST - 5, FEWEST - 8]
+
+
 def test_crumbs_are_no_bodies():
     few = torch.cat([plate(0.0), plate(0.4)[: FEWEST - 1]])
     rows = bodies_of(surfaces(few, torch.ones(len(few), dtype=torch.long), between), 0, slide())

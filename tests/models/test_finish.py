@@ -138,6 +138,9 @@ class Told:
 
     gain = saved
 
+    def own_share(self, tried, than):
+        return 1 - self(tried)[1] / self(than)[1]
+
     def improved(self, motions):
         return (*self(motions), motions)
 

@@ -1,6 +1,7 @@
 """Explanations are compared on the same pixels."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,9 +9,11 @@ from test_finish import two_states
 from tiny import slide
 
 from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.difference import weighted_loss
 from p2gs.motion.joint_confidence import state_depth
 from p2gs.motion.refine_motions import Judge, explanation_cost, what_counts
 from p2gs.motion.screw_polish import PolishConfig
+from p2gs.ops.ssim import l1_ssim_reference, ssim_map
 
 CONFIG = PolishConfig(levels=[64], level_starts=[0.0], steps=0)
 
@@ -38,6 +41,31 @@ def test_gain_is_of_the_pixels_of_both():
         told += 0.5 * math.log(cost[1] / cost[0])
     assert judge.gain(true, false) == pytest.approx(told, rel=1e-6) and told > 0.1
     assert judge.gain(false, true) == pytest.approx(-told, rel=1e-6) and judge.gain(true, true) == 0.0
+
+
+def test_a_part_saves_as_much_in_its_own_pixels_however_small_it_is():
+    """Of the panel that slides, a tenth alone; the rest stands in both explanations."""
+    judge, true, _ = panels()
+    still = replace(true, labels=[torch.zeros_like(of) for of in true.labels])
+    edge = judge.states[0].gaussians.means[:, 0] > 0.25
+    small = torch.where(edge, true.labels[0], 0)
+    tenth = replace(true, labels=[small, small])
+    whole, part = judge.own_share(true, still), judge.own_share(tenth, still)
+    assert whole > 0.3 and part > 0.3
+    assert judge.saved(tenth, still) < 0.3 * judge.saved(true, still)  # of all pixels it saves less
+    assert judge.own_share(still, tenth) < 0 and judge.own_share(true, true) == 0.0
+
+
+def test_weighted_loss_is_the_losses_mean_where_all_pixels_weigh_alike():
+    g = torch.Generator().manual_seed(0)
+    a, b = (torch.rand(24, 30, 3, generator=g) for _ in range(2))
+    even = weighted_loss(a, b, torch.ones(24, 30), 0.8) / (24 * 30)
+    assert float(even) == pytest.approx(float(l1_ssim_reference(a, b, 0.8)), rel=1e-5)
+    spot = torch.zeros(24, 30)
+    spot[7, 20] = 2.0
+    one = 0.2 * (a - b)[7, 20].abs().mean() + 0.8 * (1 - ssim_map(a, b)[7, 20].mean())
+    assert float(weighted_loss(a, b, spot, 0.8)) == pytest.approx(2 * float(one), rel=1e-4)
+    assert float(weighted_loss(a, b, torch.zeros(24, 30), 0.8)) == 0.0
 
 
 class Hiding(Judge):

@@ -2,6 +2,7 @@
 selection, labels."""
 
 from p2gs.motion.discovery.config import DiscoveryConfig
+from p2gs.motion.discovery.leftover import left_over
 from p2gs.motion.discovery.pipeline import (
     as_motions,
     discover,
@@ -28,6 +29,7 @@ __all__ = [
     "in_rows",
     "in_two",
     "instead_of",
+    "left_over",
     "places_changed",
     "relabel",
     "surface_energy",
