@@ -61,8 +61,12 @@ def reconsider(
             gained = judge.gain(refined, motions)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
             log[-1] |= {"proposed": -judge.gain(tried, motions), "energy": -gained}
+            new = part if len(refined) == len(motions) else len(motions)
+            further = lonely(states, refined, motions, new, config.same_motion)
+            if further:
+                log[-1]["saved"] = judge.own_share(refined, motions)
             better = gained > (0 if best is None else best[0])
-            if better and not (lonely(refined, motions) and judge.own_share(refined, motions) < judge.further):
+            if better and not (further and log[-1]["saved"] < judge.further):
                 best = (gained, reached, refined)
         if best is None:
             break
