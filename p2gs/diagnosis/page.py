@@ -179,7 +179,7 @@ def _discovery(d: dict) -> list[str]:
                     "image loss",
                     "energy above the chosen",
                     "",
-                    "parts; what was dropped or merged (what it saved of the image loss)",
+                    "parts; what was dropped or merged (what it saved)",
                 ],
                 rows,
             )
@@ -190,6 +190,11 @@ def _discovery(d: dict) -> list[str]:
                 [t["change"], t["type"], f"{t['cost']:.4f}", f"{t['after']:.4f}", f"{t['energy']:+.4f}"] for t in tried
             ]
             out.append(table(["tried on the chosen one", "type", "image loss", "with it", "energy"], rows))
+        sought = [t for t in found.get("reconsidered", []) if t["change"] == "sought"]
+        if sought:
+            rows = [[t["type"], _share(t["proposed"]), _share(t["own_share"])] for t in sought]
+            head = ["sought in what no part explains", "saves in its own pixels, as proposed", "refined"]
+            out.append(table(head, rows))
         rows = [[f"{p['part']}", p["type"], _amount(p), f"{p['confidence']:.2f}"] for p in found["parts"]]
         out.append(table(["part of discovery", "type", "start to end", "share explained"], rows))
     rows = [
@@ -265,6 +270,7 @@ def _finish(d: dict) -> list[str]:
             _number(j["residual"]),
             _share(j["rise"]),
             _share(j["fall"]),
+            "" if j.get("saved") is None else _share(j["saved"]),
         ]
         stages = j["confidence_by_stage"]
         values += [" &rarr; ".join(f"{c:.2f}" for c in stages.values())]
@@ -278,7 +284,7 @@ def _finish(d: dict) -> list[str]:
         "lands in free space",
         "residual / static",
     ]
-    out.append(table([*head, "residual rises by", "could fall by", "confidence by stage"], rows))
+    out.append(table([*head, "residual rises by", "could fall by", "saves in its pixels", "confidence by stage"], rows))
     return out
 
 

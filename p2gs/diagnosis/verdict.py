@@ -132,7 +132,7 @@ def _discovery(d: dict, say) -> None:
     chosen = found["explanations"][found["chosen"]] if found["chosen"] is not None else {}
     for r in chosen.get("reductions", []):
         what = {"merge": "was merged into a neighbour that moves alike", "drop": "was dropped"}[r["change"]]
-        why = f"it {told_saved(r)} of the image loss; energy without it {r['energy']:+.3f}"
+        why = f"it {told_saved(r)}; energy without it {r['energy']:+.3f}"
         say("discovery", f"A {r['type']} part {what}: {why}.", "note")
     for name, s in d["labels"].items():
         for k, share in enumerate(s["ambiguous_by_part"]):
@@ -145,10 +145,12 @@ def _discovery(d: dict, say) -> None:
 
 
 def told_saved(gone: dict) -> str:
-    """What a part that discovery dropped or merged saved. Discoveries of before 95d784a, which ``--keep_stale`` keeps,
-    have two image losses in its place."""
+    """What a part that discovery dropped or merged saved. Older discoveries, which ``--keep_stale`` keeps, have its
+    share of the whole image loss (before 95d784a: two losses) in place of that in its own pixels."""
+    if "own_share" in gone:
+        return f"saved {100 * gone['own_share']:.0f} % of the image loss in its own pixels"
     share = gone["saved"] if "saved" in gone else 1 - gone["cost_with"] / gone["cost_without"]
-    return f"saved {100 * share:.1f} %"
+    return f"saved {100 * share:.1f} % of the image loss"
 
 
 def _static(d: dict, say) -> None:

@@ -45,7 +45,7 @@ def simplify(
         if log is not None:
             done, part, into = change
             gone = {"change": done, "part": part, "into": into, "type": motions.types[part]}
-            log.append({**gone, "saved": saved, "energy": -gained})
+            log.append({**gone, "own_share": saved, "energy": -gained})
         motions = reduced
         tried.clear()
     return motions
@@ -64,9 +64,8 @@ def drop_needless(
     fewer = simplify(replace(judge, further=penalty), motions, 0.0, gone, final=True)
     for count, part in zip(range(len(motions), 0, -1), gone, strict=False):
         labels = renumbering(count, part["part"], part["into"])[labels]
-        part["why"] = (
-            f"as a {part['type']} part of its own it saves {100 * part['saved']:.0f} % of the loss in its own pixels"
-        )
+        share = f"{100 * part['own_share']:.0f} % of the image loss in its own pixels"
+        part["why"] = f"as a {part['type']} part of its own it saves {share}"
     return judge.improved(fewer)[2] if gone else motions, labels, gone
 
 

@@ -30,7 +30,7 @@ def seek(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConf
                 break
             refined = judge.refine(tried)
             after = judge.own_share(refined, motions)
-            log.append({"change": "sought", "type": tried.types[-1], "proposed": saved, "saved": after})
+            log.append({"change": "sought", "type": tried.types[-1], "proposed": saved, "own_share": after})
             best = max(best or (after, refined), (after, refined), key=lambda x: x[0])
         if best is None or best[0] < config.part_penalty:
             break

@@ -64,9 +64,9 @@ def reconsider(
             new = part if len(refined) == len(motions) else len(motions)
             further = lonely(states, refined, motions, new, config.same_motion)
             if further:
-                log[-1]["saved"] = judge.own_share(refined, motions)
+                log[-1]["own_share"] = judge.own_share(refined, motions)
             better = gained > (0 if best is None else best[0])
-            if better and not (further and log[-1]["saved"] < judge.further):
+            if better and not (further and log[-1]["own_share"] < judge.further):
                 best = (gained, reached, refined)
         if best is None:
             break

@@ -45,6 +45,7 @@ def small_run(found=None, polish_steps=0):
                 "rank": 0.1,
                 "reductions": [
                     {"change": "drop", "type": "prismatic", "saved": 0.001, "energy": -0.029},
+                    {"change": "drop", "type": "prismatic", "own_share": 0.07, "energy": -0.01},
                     {"change": "drop", "type": "revolute", "cost_with": 0.09, "cost_without": 0.1, "energy": -0.01},
                 ],
             }
@@ -83,6 +84,7 @@ def test_a_right_run_has_no_warning(right):
     assert texts(right) == [] and lost_at(verdicts(right, 1.0)) is None
     notes = [v["text"] for v in verdicts(right, 1.0)]
     assert any(t.startswith("A prismatic part was dropped: it saved 0.1 % of the image loss") for t in notes)
+    assert any("saved 7 % of the image loss in its own pixels" in t for t in notes)
     assert any(t.startswith("A revolute part was dropped: it saved 10.0 % of the image loss") for t in notes)
     (joint,) = right["joints"]
     assert joint["confidence"] > 0.7 and set(joint["confidence_by_stage"]) == {"discovery", "articulation", "finish"}
@@ -174,7 +176,10 @@ def test_the_page_tells_what_was_tried(tmp_path):
     html = (tmp_path / "diagnostics.html").read_text()
     assert d["discovery"]["reconsidered"][0]["change"] == "parted" and "0.0987" in html and "+0.0213" in html
     d["discovery"]["reconsidered"] = [{"change": "one part a body", "part": 0, "bodies": [[40, 40], [50, 50]]}]
-    assert "tried on the chosen one" not in page(d, [], "run")
+    assert "tried on the chosen one" not in page(d, [], "run") and "sought in what" not in page(d, [], "run")
+    d["discovery"]["reconsidered"] = [{"change": "sought", "type": "revolute", "proposed": 0.31, "own_share": 0.38}]
+    told = page(d, [], "run")
+    assert "sought in what no part explains" in told and "31%" in told and "38%" in told
 
 
 def test_without_discovery_and_without_parts(tmp_path):

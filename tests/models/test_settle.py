@@ -13,6 +13,8 @@ from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
 from p2gs.parts import settle
+from p2gs.parts.part_choices import lonely
+from p2gs.parts.seek import seek
 
 COARSE = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0)
 
@@ -106,6 +108,53 @@ def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
         return len(settle.reconsider(judge_of(states, views), motions, 2, PartMotionsConfig())[0])
 
     assert added(off, slide()) == 2 and added(slide(), -off + 2 * torch.eye(4).double()) == 1
+
+
+def test_a_second_door_on_the_first_ones_line_is_not_alone():
+    """As little as a further slide along another's direction: its axis is known."""
+    states, labels, _ = two_states(hinge())
+    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
+    margins = [torch.ones(len(cut))] * 2
+    one = PartMotions(["revolute"], hinge()[None], torch.ones(1), [labels, labels], margins)
+
+    def second(axis, origin, kind="revolute"):
+        T = se3.from_screw(torch.tensor(axis).double(), torch.tensor(origin).double(), 0.7)
+        if kind == "prismatic":
+            T[:3, :3] = torch.eye(3)
+        return PartMotions(["revolute", kind], torch.stack([hinge(), T]), torch.ones(2), [cut, cut], margins)
+
+    line, other = [0.0, 0.1, 1.0], [-0.4, 0.5, 0.0]
+    assert not lonely(states, second(line, [0.4, 0.5, 0.0]), one, 1, 0.04)  # the same line, 40 degrees for 29
+    assert not lonely(states, second([0.0, -0.1, -1.0], [0.4, 0.51, 0.1]), one, 1, 0.04)  # nearly, the other way
+    assert lonely(states, second(line, other), one, 1, 0.04)
+    assert lonely(states, second(line, [0.4, 0.5, 0.0], "prismatic"), one, 1, 0.04)
+    assert not lonely(states, one, one, 0, 0.04)  # no axis more
+
+
+def test_what_is_sought_must_save_its_share_once_refined(monkeypatch):
+    """The panel that slides was taken for static, as another's motion was known alone."""
+    states, labels, views = two_states(slide())
+    margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.5)
+    monkeypatch.setattr(
+        settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
+    )
+    monkeypatch.setattr(
+        settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins)
+    )
+    near = slide()
+    near[:3, 3] += torch.tensor([0.02, -0.02, 0.02])
+    first = PartMotions(["prismatic"], slide()[None], torch.ones(1), [torch.zeros_like(labels)] * 2, margins)
+    away = torch.eye(4).double()
+    away[:3, 3] = torch.tensor([-0.5, 0.3, 0.4])
+    for proposed, parts in (([(away, "prismatic"), (near, "prismatic")], 2), ([(away, "prismatic")], 1), ([], 1)):
+        monkeypatch.setattr(
+            "p2gs.parts.seek.left_over", lambda found, T, types, proposed=proposed: proposed if len(types) == 1 else []
+        )
+        motions, log = seek(judge_of(states, views), first, 3, PartMotionsConfig())
+        assert len(motions) == parts and all(entry["change"] == "sought" for entry in log)
+        if parts == 2:
+            assert float((motions.transforms[1] - slide()).norm()) < 0.01
+    assert len(seek(judge_of(states, views), first, 1, PartMotionsConfig())[0]) == 1  # no more parts than allowed
 
 
 def test_two_bodies_with_amounts_of_their_own_are_taken_where_the_energy_falls(monkeypatch):
