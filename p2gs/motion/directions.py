@@ -17,6 +17,9 @@ from p2gs.ops.knn import knn
 
 WITHIN = 15.0  # degrees within which a direction is one that is known, or an axis is meant to lie along it
 KNOWN = 1.0  # degrees to which directions are known, or an axis is another's
+LINE = (
+    0.04  # internal units (the object's diagonal is 2): hinge lines that carry a part this near to each other are one
+)
 SQUARE = 3.0  # degrees: directions that are so near to a right angle are at one
 FACING = 0.99  # cosine between a point's normal and the facing of the planes that it is taken for a point of: 8 degrees
 FEWEST = 20  # points of a plane
@@ -148,13 +151,25 @@ def shared_axes(transforms: Tensor, types: list[str]) -> Tensor:
     return out
 
 
-def has_own_axis(motions: PartMotions, part: int) -> bool:
-    """Whether no other slide goes along the slide ``part``, to ``KNOWN`` degrees; a turn's axis is its own."""
-    if motions.types[part] != "prismatic":
-        return True
-    ways = [axis_of("prismatic", T) for T in motions.transforms]
-    others = [w for k, w in enumerate(ways) if k != part and motions.types[k] == "prismatic"]
-    return all(abs(float(w @ ways[part])) < math.cos(math.radians(KNOWN)) for w in others)
+def has_own_axis(states: list[StateGaussians], motions: PartMotions, part: int, coarse: bool = False) -> bool:
+    """Whether no other joint of its type has the axis of joint ``part``, to ``KNOWN`` degrees; a turn's must be
+    another's line, too: as large a turn about that takes the part's points to within ``LINE`` of their place.
+
+    coarse: motions are not final yet, hinge lines known to ``WITHIN`` degrees.
+    """
+    kind, T = motions.types[part], motions.transforms.double()
+    axis, others = axis_of(kind, T[part]), [k for k, t in enumerate(motions.types) if t == kind and k != part]
+    least = math.cos(math.radians(WITHIN if coarse and kind == "revolute" else KNOWN))
+    others = [k for k in others if abs(float(axis_of(kind, T[k]) @ axis)) > least]
+    points = states[0].gaussians.means[motions.labels[0] == part + 1].double()
+    if kind == "prismatic" or not len(points):
+        return not others
+    at, angle = se3.apply(T[part], points), se3.screw_parameters(T[part]).angle
+    for line in map(se3.screw_parameters, T[others]):
+        there = se3.apply(se3.from_screw(line.axis * torch.sign(line.axis @ axis), line.origin, angle), points)
+        if float((there - at).norm(dim=1).mean()) < LINE:
+            return False
+    return True
 
 
 def turned_onto(kind: str, T: Tensor, direction: Tensor, middle: Tensor) -> Tensor:

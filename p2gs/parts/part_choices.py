@@ -36,7 +36,8 @@ def simplify(
             tried.add(change)
             saved, gained = judge.own_share(motions, reduced), judge.gain(reduced, motions)
             part = change[1]
-            alone = has_own_axis(motions, part) if final else lonely(judge.states, motions, reduced, part, same_motion)
+            states = judge.states
+            alone = has_own_axis(states, motions, part) if final else lonely(states, motions, reduced, part)
             junk = change[0] != "merge" and alone and saved < judge.further
             if junk or (gained >= 0 and not final):
                 break
@@ -78,23 +79,11 @@ def own_shares(judge: Judge, motions: PartMotions) -> list[float]:
     return out
 
 
-def lonely(states, more: PartMotions, fewer: PartMotions, part: int, same_motion: float) -> bool:
+def lonely(states, more: PartMotions, fewer: PartMotions, part: int) -> bool:
     """Is there an axis less with ``fewer`` than with ``more``, in which ``part`` is new? Of a row of drawers, or of
-    doors on one hinge line, each saves little, and has the axis of the others. Turns are about one line where a part
-    that goes its own amount about another's line comes to within ``same_motion`` (internal units) of its place."""
-    if axes_used(as_motions(more.transforms, more.types)) <= axes_used(as_motions(fewer.transforms, fewer.types)):
-        return False
-    points = states[0].gaussians.means[more.labels[0] == part + 1].double()
-    if more.types[part] != "revolute" or not len(points):
-        return True
-    own, at = se3.screw_parameters(more.transforms[part].double()), se3.apply(more.transforms[part].double(), points)
-    for k, kind in enumerate(more.types):
-        if k != part and kind == "revolute":
-            line = se3.screw_parameters(more.transforms[k].double())
-            T = se3.from_screw(line.axis * torch.sign(line.axis @ own.axis), line.origin, own.angle)
-            if float((se3.apply(T, points) - at).norm(dim=1).mean()) < same_motion:
-                return False
-    return True
+    doors on one hinge line, each saves little, and has the axis of the others."""
+    used = [axes_used(as_motions(m.transforms, m.types)) for m in (more, fewer)]
+    return used[0] > used[1] and has_own_axis(states, more, part, coarse=True)
 
 
 def join_twins(states, motions: PartMotions, reach: float) -> tuple[PartMotions, list[dict]]:

@@ -62,7 +62,7 @@ def reconsider(
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
             log[-1] |= {"proposed": -judge.gain(tried, motions), "energy": -gained}
             new = part if len(refined) == len(motions) else len(motions)
-            further = lonely(states, refined, motions, new, config.same_motion)
+            further = lonely(states, refined, motions, new)
             if further:
                 log[-1]["own_share"] = judge.own_share(refined, motions)
             better = gained > (0 if best is None else best[0])

@@ -124,11 +124,11 @@ def test_a_second_door_on_the_first_ones_line_is_not_alone():
         return PartMotions(["revolute", kind], torch.stack([hinge(), T]), torch.ones(2), [cut, cut], margins)
 
     line, other = [0.0, 0.1, 1.0], [-0.4, 0.5, 0.0]
-    assert not lonely(states, second(line, [0.4, 0.5, 0.0]), one, 1, 0.04)  # the same line, 40 degrees for 29
-    assert not lonely(states, second([0.0, -0.1, -1.0], [0.4, 0.51, 0.1]), one, 1, 0.04)  # nearly, the other way
-    assert lonely(states, second(line, other), one, 1, 0.04)
-    assert lonely(states, second(line, [0.4, 0.5, 0.0], "prismatic"), one, 1, 0.04)
-    assert not lonely(states, one, one, 0, 0.04)  # no axis more
+    assert not lonely(states, second(line, [0.4, 0.5, 0.0]), one, 1)  # the same line, 40 degrees for 29
+    assert not lonely(states, second([0.0, -0.1, -1.0], [0.4, 0.52, 0.1]), one, 1)  # nearly, the other way
+    assert lonely(states, second(line, other), one, 1)
+    assert lonely(states, second(line, [0.4, 0.5, 0.0], "prismatic"), one, 1)
+    assert not lonely(states, one, one, 0)  # no axis more
 
 
 def test_what_is_sought_must_save_its_share_once_refined(monkeypatch):
