@@ -9,6 +9,7 @@ from tiny import hinge, slide
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.models.part_discovery import PartMotionsConfig
+from p2gs.motion.directions import has_own_axis
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
@@ -129,6 +130,9 @@ def test_a_second_door_on_the_first_ones_line_is_not_alone():
     assert lonely(states, second(line, other), one, 1)
     assert lonely(states, second(line, [0.4, 0.5, 0.0], "prismatic"), one, 1)
     assert not lonely(states, one, one, 0)  # no axis more
+    tilted = second([0.0, 0.15, 1.0], [0.4, 0.5, 0.0])  # by three degrees: as good as one line while motions are coarse
+    assert has_own_axis(states, tilted, 1) and not has_own_axis(states, tilted, 1, coarse=True)
+    assert not has_own_axis(states, second(line, [0.4, 0.5, 0.0]), 1)
 
 
 def test_what_is_sought_must_save_its_share_once_refined(monkeypatch):
