@@ -143,7 +143,7 @@ def _improved(
         motions, reconsidered = reconsider(judge, motions, limit, config)
         changed += reconsidered
         motions = simplify(judge, motions, config.same_motion, changed)
-    if config.seek:
+    if config.seek > 0:
         say("looking for what no part explains")
         known = len(motions)
         motions, sought = seek(judge, motions, limit, config)

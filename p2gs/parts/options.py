@@ -26,7 +26,9 @@ class PartMotionsConfig:
     surface they touch (0 = off).  rounds: how often labels, types and motions are settled anew.
     reconsider: each part's motion, one more, two parts with their ends exchanged, and each part as two are searched
     again amid the others, refined, and taken where the energy falls.
-    seek: surface that no motion explains is then searched by itself for further parts, however small.
+    seek: surface that no motion explains is then searched by itself for further parts, however small; share of the
+    image loss in its own pixels that such a part must save (0: none is sought). False ones saved up to 0.27, latches
+    of a hundredth of the moved surface 0.38.
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to
     nothing of it.
     askew: share of the image loss that an axis must save which is askew to the directions that the object has, against
@@ -45,7 +47,7 @@ class PartMotionsConfig:
     islands: float = 0.25
     rounds: int = 2
     reconsider: bool = True
-    seek: bool = True
+    seek: float = 0.3
     min_confidence: float = 0.02
     askew: float = 0.01
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)

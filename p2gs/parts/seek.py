@@ -13,7 +13,7 @@ FEWEST = 20  # Gaussians of a part in each state
 
 def seek(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:
     """With further parts, up to ``limit``, for surface that no motion explains (``left_over``): each that saves at
-    least ``config.part_penalty`` of the image loss in its own pixels (``Judge.own_share``).  Returns the motions and
+    least ``config.seek`` of the image loss in its own pixels (``Judge.own_share``).  Returns the motions and
     what was tried."""
     log: list[dict] = []
     if judge.found is None:
@@ -32,7 +32,7 @@ def seek(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConf
             after = judge.own_share(refined, motions)
             log.append({"change": "sought", "type": tried.types[-1], "proposed": saved, "own_share": after})
             best = max(best or (after, refined), (after, refined), key=lambda x: x[0])
-        if best is None or best[0] < config.part_penalty:
+        if best is None or best[0] < config.seek:
             break
         motions = best[1]
     return motions, log
