@@ -159,6 +159,7 @@ def fitted(x: np.ndarray, right: np.ndarray, weight: np.ndarray, damping: float 
 def fit(file: Path) -> None:
     """Print the weights, and what they reach on scenes left out one by one."""
     rows = [json.loads(line) for line in file.read_text().splitlines()]
+    rows = [r for r in rows if r["views"]]  # what no photograph shows has no confidence whatever the weights
     names = list(JointEvidence.__dataclass_fields__)
     x = np.array([features(JointEvidence(**{n: r[n] for n in names})) for r in rows])
     right, scene = np.array([r["right"] for r in rows]), np.array([r["name"] for r in rows])

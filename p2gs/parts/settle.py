@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.motion.directions import directions_of
+from p2gs.motion.directions import LINE, directions_of
 from p2gs.motion.discovery import Candidate, Discovery, in_rows, in_two, instead_of, places_changed, relabel
 from p2gs.motion.refine_motions import Judge
+from p2gs.ops import se3
 from p2gs.ops.sh import dc_to_rgb
 from p2gs.parts.islands import settle_islands
 from p2gs.parts.options import PartMotionsConfig
@@ -30,21 +32,23 @@ def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tup
 def reconsider(
     judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig
 ) -> tuple[PartMotions, list[dict]]:
-    """Exchange motions for others that explain what the refined rest leaves over, those of two like parts for such as
-    change their ends, add one, make one part two, or many of a row of drawers, while the energy falls.
+    """Exchange motions for others that explain what the refined rest leaves over, or that turn a part over, those of
+    two like parts for such as change their ends, add one, make one part two, or many of a row of drawers, while the
+    energy falls.
 
-    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for two parts such
-    as take each for the other at the end (``places_changed``), for each part the two amounts about one axis that
-    explain most (``in_two``), and the amounts of all bodies that slid one way (``in_rows``). Under each proposal
-    every surfel chooses its part anew, and with the ``candidates`` of each kind that surfaces like best the states
-    are re-rendered. The best of each kind is refined, and the energy must fall; with a further part the image loss
-    must as well, in its own pixels (``Judge.own_share``): what surfaces alone gain is junk. Returns the motions and
-    what was tried.
+    For each part, and below ``limit`` for one more, the search proposes motions (``instead_of``), for a turning part
+    its half turns (``_turned_over``), for two parts such as take each for the other at the end (``places_changed``),
+    for each part the two amounts about one axis that explain most (``in_two``), and the amounts of all bodies that
+    slid one way (``in_rows``). Under each proposal every surfel chooses its part anew, and with the ``candidates`` of
+    each kind that surfaces like best the states are re-rendered. The best of each kind is refined, and the energy must
+    fall; with a further part the image loss must as well, in its own pixels (``Judge.own_share``): what surfaces alone
+    gain is junk. Returns the motions and what was tried.
     """
     found, states, log = judge.found, judge.states, []
     _, cost = judge(motions)
     for _ in range(limit if len(motions) else 0):
         tries = {"exchanged": [(k, m) for k in range(len(motions)) for m in _with_part(found, states, motions, k)]}
+        tries["turned over"] = _turned_over(found, states, motions)
         tries["crossed"] = _proposed(found, states, motions, places_changed(found, motions.transforms, motions.types))
         if len(motions) < limit:
             tries["added"] = [(len(motions), m) for m in _with_part(found, states, motions, None)]
@@ -79,6 +83,24 @@ def _with_part(found: Discovery, states, motions: PartMotions, part: int | None)
     k, out = len(motions) if part is None else part, []
     for transform, kind in instead_of(found, motions.transforms, motions.types, part):
         out.append(relabelled(found, states, motions.with_motion(k, kind, transform)))
+    return out
+
+
+def _turned_over(found: Discovery, states, motions: PartMotions) -> list[tuple[int, PartMotions]]:
+    """Each turning part with a half turn of its own before its motion: a plate turned over, front for back, or a cross
+    covers its place as well. Half turns are about the principal axes of its points; what is no turn then is left
+    out."""
+    out = []
+    for k, (kind, T) in enumerate(zip(motions.types, motions.transforms.double(), strict=True)):
+        points = states[0].gaussians.means[motions.labels[0] == k + 1].double()
+        if kind != "revolute" or len(points) < 3:
+            continue
+        middle = points.mean(0)
+        for axis in torch.linalg.svd(points - middle, full_matrices=False)[2]:
+            over = T @ se3.from_screw(axis, middle, math.pi)
+            turn = se3.project_revolute(over)
+            if float((se3.apply(over, points) - se3.apply(turn, points)).norm(dim=1).mean()) < LINE:
+                out.append((k, relabelled(found, states, motions.with_motion(k, kind, turn))))
     return out
 
 

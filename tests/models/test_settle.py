@@ -1,5 +1,7 @@
 """A part whose motion was fitted to the others' remains is asked for once more, and the photographs decide."""
 
+import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -109,6 +111,28 @@ def test_a_further_part_must_explain_the_photographs_better(monkeypatch):
         return len(settle.reconsider(judge_of(states, views), motions, 2, PartMotionsConfig())[0])
 
     assert added(off, slide()) == 2 and added(slide(), -off + 2 * torch.eye(4).double()) == 1
+
+
+def test_a_part_that_was_found_turned_over_is_turned_back(monkeypatch):
+    """A door's panel, front for back about the middle of itself: only its texture tells."""
+    states, labels, views = two_states(hinge())
+    margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.5)
+    monkeypatch.setattr(
+        settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
+    )
+    monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
+    monkeypatch.setattr(settle, "instead_of", lambda *a: [])
+    points = states[0].gaussians.means[labels == 1].double()
+    upright = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2]
+    upright = upright[(upright @ torch.tensor([0.0, 0.1, 1.0]).double()).abs().argmax()]
+    over = se3.project_revolute(hinge() @ se3.from_screw(upright, points.mean(0), math.pi))
+    motions = PartMotions(["revolute"], over[None], torch.ones(1), [labels, labels], margins)
+    found, log = settle.reconsider(judge_of(states, views), motions, 1, PartMotionsConfig())
+    assert log[0]["change"] == "turned over" and log[0]["energy"] < 0
+    assert float((se3.apply(found.transforms[0], points) - se3.apply(hinge(), points)).norm(dim=1).mean()) < 0.02
+    # right as it is
+    motions = replace(motions, transforms=hinge()[None])
+    assert settle.reconsider(judge_of(states, views), motions, 1, PartMotionsConfig())[0] is motions
 
 
 def test_a_second_door_on_the_first_ones_line_is_not_alone():
