@@ -29,24 +29,23 @@ def simplify(
     that shares its axis, for of a row's shut drawers photographs alone know little.
     """
     tried: set[tuple] = set()
+    states = judge.states
     while len(motions):
-        for change, reduced in _reductions(judge.states, motions, same_motion, final):
+        for change, reduced in _reductions(states, motions, same_motion, final):
             if change in tried:
                 continue
             tried.add(change)
-            saved, gained = judge.own_share(motions, reduced), judge.gain(reduced, motions)
-            part = change[1]
-            states = judge.states
+            done, part, into = change
+            gained = judge.gain(reduced, motions)
             alone = has_own_axis(states, motions, part) if final else lonely(states, motions, reduced, part)
-            junk = change[0] != "merge" and alone and saved < judge.further
+            junk = done != "merge" and alone and judge.own_share(motions, reduced) < judge.further
             if junk or (gained >= 0 and not final):
                 break
         else:
             return motions
         if log is not None:
-            done, part, into = change
             gone = {"change": done, "part": part, "into": into, "type": motions.types[part]}
-            log.append({**gone, "own_share": saved, "energy": -gained})
+            log.append({**gone, "own_share": judge.own_share(motions, reduced), "energy": -gained})
         motions = reduced
         tried.clear()
     return motions

@@ -13,8 +13,8 @@ FEWEST = 20  # Gaussians of a part in each state
 
 def seek(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:
     """With further parts, up to ``limit``, for surface that no motion explains (``left_over``): each that saves at
-    least ``config.seek`` of the image loss in its own pixels (``Judge.own_share``).  Returns the motions and
-    what was tried."""
+    least ``config.seek`` of the image loss in its own pixels (``Judge.own_share``), once refined. Returns the motions
+    and what was tried."""
     log: list[dict] = []
     if judge.found is None:
         return motions, log

@@ -79,7 +79,7 @@ phases:
     {steps: 150, initial_gaussians: 1500, levels: [32, 64], level_starts: [0.0, 0.3],
      losses: {own_grey: {weight: 0.01}}, callbacks: {densify: {budget: 2000, every: 20}}}
   discovery:
-    {evidence_size: 64, reconsider: false, rounds: 1, survey: [], coarse: {steps: 5, levels: [64]},
+    {evidence_size: 64, reconsider: false, seek: 0, rounds: 1, survey: [], coarse: {steps: 5, levels: [64]},
      search: {surfels: 1500, samples: 80, searches: 1, candidates: 1}}
   canonical_fusion: {steps: 6, levels: [64], level_starts: [0.0], canonical: {match_size: 300}}
   colours: {steps: 6, levels: [64], level_starts: [0.0], losses: {render: {}}, callbacks: {joint_log: {every: 2}}}

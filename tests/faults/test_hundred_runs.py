@@ -31,6 +31,7 @@ phases:
     evidence_size: 48
     look_steps: 2
     reconsider: false
+    seek: 0
     rounds: 1
     survey: []
     search: {surfels: 500, samples: 50, searches: 1, candidates: 1}

@@ -29,6 +29,7 @@ phases:
     evidence_size: 64
     look_steps: 4
     reconsider: false
+    seek: 0
     rounds: 1
     survey: []
     search: {{surfels: 1000, samples: 100, searches: 1, candidates: 1}}
