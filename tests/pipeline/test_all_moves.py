@@ -19,7 +19,7 @@ include: [{repo}/configs/preset/smoke.yaml]
 data: {{format: artgs, root: {root}, depth: never}}
 num_parts: 2
 phases:
-{phases}  finish: {{polish: {{steps: 8, levels: [64], level_starts: [0.0]}}, exports: [all]}}
+{phases}  finish: {{polish: {{steps: 8, levels: [64], level_starts: [0.0]}}, part_penalty: 0, exports: [all]}}
 """
 
 
