@@ -49,10 +49,8 @@ def searched(case: Case) -> SimpleNamespace:
         for s, v in zip(case.states, train, strict=True)
     ]
     problem = build_problem(*seen, config.search, case.cfg.seed)[0]
-    samples = [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in problem.samples]
-    search = Search(
-        problem, sweep(problem, directions(problem), samples), config.search.max_parts - 1, config.search.part_cost
-    )
+    swept = sweep(problem, directions(problem))
+    search = Search(problem, swept, config.search.max_parts - 1, config.search.part_cost)
     return SimpleNamespace(
         problem=problem, graphs=[Graph(s.points, s.normals, s.colours) for s in problem.surfels], search=search
     )

@@ -9,10 +9,10 @@ from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import StateGaussians
 from p2gs.motion.joint_confidence import measuring_level
 from p2gs.motion.screw_polish import MovedGaussians
-from p2gs.ops.ssim import ssim_map
+from p2gs.ops.ssim import gaussian_window, ssim_map
 
 LOOKS = 16  # photographs of a state, spread over all
-REACH = 5  # pixels that SSIM looks around itself
+REACH = len(gaussian_window()) // 2  # pixels that SSIM looks around itself
 
 
 @torch.no_grad()

@@ -17,9 +17,8 @@ from p2gs.ops.knn import knn
 
 WITHIN = 15.0  # degrees within which a direction is one that is known, or an axis is meant to lie along it
 KNOWN = 1.0  # degrees to which directions are known, or an axis is another's
-LINE = (
-    0.04  # internal units (the object's diagonal is 2): hinge lines that carry a part this near to each other are one
-)
+# internal units (the object's diagonal is 2): hinge lines that carry a part this near to each other are one
+LINE = 0.04
 SQUARE = 3.0  # degrees: directions that are so near to a right angle are at one
 FACING = 0.99  # cosine between a point's normal and the facing of the planes that it is taken for a point of: 8 degrees
 FEWEST = 20  # points of a plane

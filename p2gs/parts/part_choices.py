@@ -36,16 +36,17 @@ def simplify(
                 continue
             tried.add(change)
             done, part, into = change
-            gained = judge.gain(reduced, motions)
+            if not final and judge.gain(reduced, motions) >= 0:
+                break
             alone = has_own_axis(states, motions, part) if final else lonely(states, motions, reduced, part)
-            junk = done != "merge" and alone and judge.own_share(motions, reduced) < judge.further
-            if junk or (gained >= 0 and not final):
+            if done != "merge" and alone and judge.own_share(motions, reduced) < judge.further:
                 break
         else:
             return motions
         if log is not None:
             gone = {"change": done, "part": part, "into": into, "type": motions.types[part]}
-            log.append({**gone, "own_share": judge.own_share(motions, reduced), "energy": -gained})
+            log.append({**gone, "own_share": judge.own_share(motions, reduced)})
+            log[-1]["energy"] = -judge.gain(reduced, motions)
         motions = reduced
         tried.clear()
     return motions

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from operator import itemgetter
+
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.discovery import left_over
 from p2gs.motion.refine_motions import Judge
@@ -24,15 +27,15 @@ def seek(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConf
             tried = relabelled(judge.found, judge.states, motions.with_motion(len(motions), kind, T))
             if min(int((of == len(tried)).sum()) for of in tried.labels) >= FEWEST:
                 looked.append((judge.own_share(tried, motions), tried))
-        best = None
-        for saved, tried in sorted(looked, key=lambda x: -x[0])[: config.candidates]:
-            if saved <= 0:
-                break
-            refined = judge.refine(tried)
-            after = judge.own_share(refined, motions)
-            log.append({"change": "sought", "type": tried.types[-1], "proposed": saved, "own_share": after})
-            best = max(best or (after, refined), (after, refined), key=lambda x: x[0])
-        if best is None or best[0] < config.seek:
+        refined = []
+        for saved, tried in sorted(looked, key=itemgetter(0), reverse=True)[: config.candidates]:
+            if saved > 0:
+                after = judge.refine(tried)
+                refined.append((judge.own_share(after, motions), after))
+                told = {"type": tried.types[-1], "proposed": saved, "own_share": refined[-1][0]}
+                log.append({"change": "sought", **told})
+        saved, best = max(refined, key=itemgetter(0), default=(-math.inf, motions))
+        if saved < config.seek:
             break
-        motions = best[1]
+        motions = best
     return motions, log

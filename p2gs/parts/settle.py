@@ -66,11 +66,11 @@ def reconsider(
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
             log[-1] |= {"proposed": -judge.gain(tried, motions), "energy": -gained}
             new = part if len(refined) == len(motions) else len(motions)
-            further = lonely(states, refined, motions, new)
-            if further:
-                log[-1]["own_share"] = judge.own_share(refined, motions)
             better = gained > (0 if best is None else best[0])
-            if better and not (further and log[-1]["own_share"] < judge.further):
+            if better and lonely(states, refined, motions, new):
+                log[-1]["own_share"] = judge.own_share(refined, motions)
+                better = log[-1]["own_share"] >= judge.further
+            if better:
                 best = (gained, reached, refined)
         if best is None:
             break

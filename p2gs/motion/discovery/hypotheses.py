@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from p2gs.motion.discovery.config import DiscoveryConfig
 from p2gs.motion.discovery.fields import Landing, normal_code
 from p2gs.motion.discovery.problem import Problem, one_sided
 from p2gs.motion.discovery.rigid import Motions, perpendicular
 
+SWEPT = 256  # moved surfels of a state that the sweep looks at
 PLATE = 0.5  # thickness of plates in the sweep, coarse voxels: surfaces within three quarters of one count as met
 OTHER_SIDE = 0.8  # evidence of a plate's other side beside that of the same surface: its colours confirm nothing
 
@@ -133,12 +135,19 @@ class Sweep:
         return known + free.sum(0)
 
 
-def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120000) -> Sweep:
-    """Try all slides and turns about ``axes``; steps are a voxel or so of displacement.
+def angles_of(config: DiscoveryConfig) -> Tensor:
+    """The angles that turns are searched at, radians."""
+    return torch.arange(math.radians(config.min_angle), math.radians(config.max_angle) + 0.01, math.radians(7.0))
+
+
+def sweep(problem: Problem, axes: Tensor, keep: int = 120000) -> Sweep:
+    """Try all slides and turns about ``axes`` on ``SWEPT`` of the problem's samples; steps are a voxel or so of
+    displacement.
 
     Only motions with some evidence in both states, or much in one, are kept, at most ``keep`` of them.
     """
     cfg, diag = problem.config, problem.scale.diag
+    samples = [s[torch.linspace(0, len(s) - 1, min(SWEPT, len(s))).long()] for s in problem.samples]
     landings = problem.landings
     tables = [arrival_table(landings[s], problem.moved[s]) for s in (0, 1)]
     behind = [arrival_table(landings[s], problem.moved[s], OTHER_SIDE) for s in (0, 1)]
@@ -176,12 +185,11 @@ def sweep(problem: Problem, axes: Tensor, samples: list[Tensor], keep: int = 120
         C = len(amounts)
         keep_good(Motions(torch.zeros(C, dtype=torch.bool), d.expand(C, 3), problem.centre.expand(C, 3), amounts), q)
     span = hc * (size - 1)
-    angles = torch.arange(math.radians(cfg.min_angle), math.radians(cfg.max_angle) + 0.01, math.radians(7.0))
     for d in axes:
         e1, e2 = perpendicular(d)
         frame = torch.stack([e1, e2, d])
         half = (frame.abs() @ span) / 2 + 0.02 * diag
-        for angle in angles.tolist():
+        for angle in angles_of(cfg).tolist():
             step = min(max(1.4 * hc / (2 * math.sin(angle / 2)), 0.02 * diag), 0.09 * diag)
             g = [torch.arange(-float(half[k]), float(half[k]) + step, step) for k in (0, 1)]
             grid = torch.stack(torch.meshgrid(*g, indexing="ij"), -1).reshape(-1, 2)

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from p2gs.motion.discovery.hypotheses import directions, static_axes, sweep
+from p2gs.motion.discovery.hypotheses import angles_of, directions, static_axes, sweep
 from p2gs.motion.discovery.labels import label
 from p2gs.motion.discovery.pipeline import as_motions, sided, stacked
-from p2gs.motion.discovery.problem import Problem, paid, resampled, smooth_mask
+from p2gs.motion.discovery.problem import Problem, resampled, smooth_mask
 from p2gs.motion.discovery.result import Discovery
 from p2gs.motion.discovery.rigid import Motions
 from p2gs.motion.discovery.search import ExclusiveGain, Search
 from p2gs.motion.discovery.verify import violation
 
-SWEPT = 256  # surfels of a state that the sweep looks at
 SETS = 2  # best sets of motions that are taken from
 
 
@@ -33,8 +31,7 @@ def left_over(found: Discovery, transforms: Tensor, types: list[str]) -> list[tu
         return []
     problem = resampled(replace(found.problem, moved=unexplained), 0)
     axes = torch.cat([directions(problem), static_axes(problem)])
-    looked = [s[torch.linspace(0, len(s) - 1, min(SWEPT, len(s))).long()] for s in problem.samples]
-    search = Search(problem, sweep(problem, axes, looked), config.max_parts - 1, config.part_cost)
+    search = Search(problem, sweep(problem, axes), config.max_parts - 1, config.part_cost)
     chosen = sorted({k for _, some in search.solve()[:SETS] for k in some})
     if not chosen:
         return []
@@ -62,12 +59,11 @@ def contradicted(found: Discovery, motions: Motions) -> list[Tensor]:
 def as_turns(problem: Problem, slide: Motions, axes: Tensor) -> Motions:
     """Turns about ``axes`` [D, 3] by all angles that are searched which take the middle of what ``slide`` [1] carries
     where it does."""
-    pay = paid(problem.cost(slide, 0, problem.samples[0])[0][0], problem.config.unexplained)
+    pay = problem.pay(slide)[0][0][0]
     if float(pay.sum()) <= 0:
         return Motions.empty()
     middle = (problem.surfels[0].points[problem.samples[0]] * pay[:, None]).sum(0) / pay.sum()
-    config = problem.config
-    angles = torch.arange(math.radians(config.min_angle), math.radians(config.max_angle), math.radians(7.0))
+    angles = angles_of(problem.config)
     angles = torch.cat([angles, -angles])
     axis, angle = axes.repeat_interleave(len(angles), 0), angles.repeat(len(axes))
     way = slide.axis * slide.amount[:, None]

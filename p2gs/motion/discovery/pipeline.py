@@ -71,9 +71,7 @@ def discover(
         figures |= {"axes": axes.tolist(), "search": []}
         for number in range(searches):
             looked = problem if number == 0 else resampled(problem, seed + number)
-            swept = sweep(
-                looked, axes, [s[torch.linspace(0, len(s) - 1, min(256, len(s))).long()] for s in looked.samples]
-            )
+            swept = sweep(looked, axes)
             one = Search(looked, swept, most, config.part_cost)
             search = search or one
             solutions = one.solve()
