@@ -18,6 +18,7 @@ from p2gs.models.stage import Stage, register_phase
 from p2gs.motion.discovery import Discovery, StateEvidence, discover, relabel
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.survey import leave_false_minima
+from p2gs.native import at_once
 from p2gs.parts.askew import lay_axes
 from p2gs.parts.bodies import Surfaces, one_part_a_body
 from p2gs.parts.expand import expand
@@ -108,7 +109,7 @@ def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say)
         return explanations, []
     say(f"a quick look at {len(explanations)} explanations")
     quick = judge.at_a_glance(config.look_steps)
-    looks = [quick(quick.refine(_label_states(e, judge.states)))[0] for e in explanations]
+    looks = at_once([lambda e=e: quick(quick.refine(_label_states(e, judge.states)))[0] for e in explanations])
     order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
     return [explanations[i] for i in order], looks
 
@@ -116,15 +117,19 @@ def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say)
 def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
     """The explanation of lowest energy, refined and without parts that it is better without; which it was, and of each
     the image loss and how much higher its energy is ("rank")."""
-    refined, tried, chosen = [], [], 0
-    for number, explanation in enumerate(explanations):
-        motions = _label_states(explanation, judge.states)
-        if len(explanations) > 1:
-            say(f"re-rendering explanation {number + 1} of {len(explanations)}")
+    if len(explanations) > 1:
+        say(f"re-rendering {len(explanations)} explanations")
+
+    def one(explanation) -> tuple[PartMotions, dict]:
         reductions: list[dict] = []
-        refined.append(simplify(judge, judge.improved(motions)[2], config.same_motion, reductions))
-        tried.append({"types": refined[-1].types, "cost": judge.cost(refined[-1]), "reductions": reductions})
-        if judge.gain(refined[-1], refined[chosen]) > 0:
+        better = judge.improved(_label_states(explanation, judge.states))[2]
+        motions = simplify(judge, better, config.same_motion, reductions)
+        return motions, {"types": motions.types, "cost": judge.cost(motions), "reductions": reductions}
+
+    looked, chosen = at_once([partial(one, e) for e in explanations]), 0
+    refined, tried = [motions for motions, _ in looked], [told for _, told in looked]
+    for number, motions in enumerate(refined):
+        if judge.gain(motions, refined[chosen]) > 0:
             chosen = number
     for one, motions in zip(tried, refined, strict=True):
         one["rank"] = judge.gain(refined[chosen], motions)

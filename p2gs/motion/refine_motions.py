@@ -17,6 +17,7 @@ from p2gs.motion.difference import image_losses
 from p2gs.motion.discovery import Discovery, surface_energy
 from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.screw_polish import PolishConfig, Side, photometric_cost, polish
+from p2gs.native import at_once
 from p2gs.ops import se3
 from p2gs.visibility.depth_stack import DepthStack
 
@@ -93,7 +94,7 @@ def single_ways(
     short = replace(config, steps=max(config.steps // 3, 1), rate=config.rate / 2)
     sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
     options = {"seed": seed, "backend": backend, "device": device}
-    found = [polish([side], motions.transforms, motions.types, short, **options) for side in sides]
+    found = at_once([partial(polish, [side], motions.transforms, motions.types, short, **options) for side in sides])
     return {name: T for name, (T, _) in zip(("forward", "backward"), found, strict=True)}
 
 
@@ -117,16 +118,15 @@ def explanation_cost(
     these motions).
     """
     seen = what_counts(states, motions, config, stacks, backend=backend, device=device) if seen is None else seen
-    ways, level, total = (
-        (motions.transforms, se3.inverse(motions.transforms)),
-        config.levels[-1] if level is None else level,
-        0.0,
-    )
-    for s in (0, 1):
-        labels, options = torch.where(seen[s].kept, motions.labels[s], -1), {"backend": backend, "device": device}
-        there = {"level": level, "shown": seen[1 - s].pixels, "hidden": HIDDEN}
-        total += photometric_cost(states[s].gaussians, labels, ways[s], views[1 - s], **there, **options)
-    return 0.5 * total
+    ways = (motions.transforms, se3.inverse(motions.transforms))
+    options = {"level": config.levels[-1] if level is None else level, "backend": backend, "device": device}
+
+    def one_way(s: int) -> float:
+        labels = torch.where(seen[s].kept, motions.labels[s], -1)
+        there = {"shown": seen[1 - s].pixels, "hidden": HIDDEN}
+        return photometric_cost(states[s].gaussians, labels, ways[s], views[1 - s], **there, **options)
+
+    return 0.5 * sum(at_once([partial(one_way, s) for s in (0, 1)]))
 
 
 @dataclass
@@ -191,8 +191,11 @@ class Judge:
         Which pixels count depends on the motions: a front that is carried into the body is hidden there, and its
         pixels are no longer asked. By its own pixels each explanation would be judged by the data that it chose.
         """
-        ratios = [max(self.cost(than, by), 1e-9) / max(self.cost(tried, by), 1e-9) for by in (tried, than)]
-        return 0.5 * sum(map(math.log, ratios))
+
+        def ratio(by: PartMotions) -> float:
+            return max(self.cost(than, by), 1e-9) / max(self.cost(tried, by), 1e-9)
+
+        return 0.5 * sum(map(math.log, at_once([partial(ratio, by) for by in (tried, than)])))
 
     def own_share(self, tried: PartMotions, than: PartMotions) -> float:
         """Share of the image loss that ``tried`` saves against ``than`` (-inf..1), each pixel weighted by how far their
@@ -200,20 +203,22 @@ class Judge:
 
         Of the whole image a small part saves little however right it is; this is alike for parts of any size.
         """
-        lost = torch.zeros(2, dtype=torch.float64)
-        for s in (0, 1):
+
+        def one_way(s: int, seen: list[Seen]) -> Tensor:
             ways = [se3.inverse(m.transforms) if s else m.transforms for m in (tried, than)]
-            for seen in (self.seen(tried), self.seen(than)):
-                drawn = [torch.where(seen[s].kept, m.labels[s], -1) for m in (tried, than)]
-                lost += image_losses(
-                    self.states[s],
-                    list(zip(drawn, ways, strict=True)),
-                    self.views[1 - s],
-                    self.config.ssim_lambda,
-                    seen[1 - s].pixels,
-                    self.backend,
-                    self.device,
-                )
+            drawn = [torch.where(seen[s].kept, m.labels[s], -1) for m in (tried, than)]
+            return image_losses(
+                self.states[s],
+                list(zip(drawn, ways, strict=True)),
+                self.views[1 - s],
+                self.config.ssim_lambda,
+                seen[1 - s].pixels,
+                self.backend,
+                self.device,
+            )
+
+        both = [self.seen(tried), self.seen(than)]
+        lost = torch.stack(at_once([partial(one_way, s, seen) for s in (0, 1) for seen in both])).sum(0)
         return float(1 - lost[0] / lost[1]) if float(lost[1]) > 0 else 0.0
 
     def gain(self, tried: PartMotions, than: PartMotions) -> float:
@@ -266,11 +271,11 @@ def what_counts(
 ) -> list[Seen]:
     """Of both states, under these motions. Pixels count as far as they are not of surface that the other state hides;
     everything does where a tolerance of ``config`` is 0."""
-    out = []
-    for s in (0, 1):
+
+    def of(s: int) -> Seen:
         if config.free_static <= 0 or config.free_moving <= 0:
-            out.append(Seen(torch.ones(len(motions.labels[s]), dtype=torch.bool), None))
-            continue
+            return Seen(torch.ones(len(motions.labels[s]), dtype=torch.bool), None)
         kept, shown = kept_and_shown(states, motions, s, stacks, config)
-        out.append(Seen(kept, ShownPixels(states[s], shown | ~kept, backend, device)))
-    return out
+        return Seen(kept, ShownPixels(states[s], shown | ~kept, backend, device))
+
+    return at_once([partial(of, s) for s in (0, 1)])

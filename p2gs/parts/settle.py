@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.directions import LINE, directions_of
 from p2gs.motion.discovery import Candidate, Discovery, in_rows, in_two, instead_of, places_changed, relabel
 from p2gs.motion.refine_motions import Judge
+from p2gs.native import at_once
 from p2gs.ops import se3
 from p2gs.ops.sh import dc_to_rgb
 from p2gs.parts.islands import settle_islands
@@ -56,13 +58,10 @@ def reconsider(
             in_row = in_rows(found, motions.transforms, motions.types, directions_of(states, motions), limit)
             tries["in a row"] = _proposed(found, states, motions, [(0, *row) for row in in_row])
         best = None
-        for change, proposed in tries.items():
-            if not proposed:
-                continue
-            proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[: config.candidates]
-            part, tried = max(proposed, key=lambda p: judge.gain(p[1], motions))
-            _, reached, refined = judge.improved(tried)
-            gained = judge.gain(refined, motions)
+        kinds = [change for change, proposed in tries.items() if proposed]
+        jobs = [partial(_best_refined, judge, motions, tries[change], config.candidates) for change in kinds]
+        for change, (part, tried, refined) in zip(kinds, at_once(jobs), strict=True):
+            gained, reached = judge.gain(refined, motions), judge.cost(refined)
             log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
             log[-1] |= {"proposed": -judge.gain(tried, motions), "energy": -gained}
             new = part if len(refined) == len(motions) else len(motions)
@@ -76,6 +75,16 @@ def reconsider(
             break
         _, cost, motions = best
     return motions, log
+
+
+def _best_refined(
+    judge: Judge, motions: PartMotions, proposed: list[tuple[int, PartMotions]], count: int
+) -> tuple[int, PartMotions, PartMotions]:
+    """Of the ``count`` proposals (part, motions) that surfaces like best the one of least energy: its part, its motions
+    and these refined."""
+    proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[:count]
+    part, tried = max(proposed, key=lambda p: judge.gain(p[1], motions))
+    return part, tried, judge.improved(tried)[2]
 
 
 def _with_part(found: Discovery, states, motions: PartMotions, part: int | None) -> list[PartMotions]:
@@ -128,19 +137,16 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
 
     For up to ``rounds`` rounds, while the energy falls. Returns the motions and what each round measured.
     """
-    found, states, rounds = judge.found, judge.states, []
+    rounds = []
     for number in range(config.rounds if len(motions) else 0):
         cost, best = judge.cost(motions), None
+        jobs = [partial(settled, judge, motions, config, anew) for anew in (False, True)]
         # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from
         # here on
-        for name in ("kept", "anew"):
-            tried = relabelled(found, states, motions) if name == "anew" else motions
-            labels, count = settle_islands(
-                [s.gaussians for s in states], tried.labels, tried.transforms, config.islands
-            )
-            if all(map(torch.equal, labels, motions.labels)):
+        for name, done in zip(("kept", "anew"), at_once(jobs), strict=True):
+            if done is None:
                 continue
-            _, reached, tried = judge.improved(replace(tried, labels=labels))
+            count, reached, tried = done
             gained = judge.gain(tried, motions)
             told = {"round": number, "labels": name, "islands": count, "before": cost, "after": reached}
             rounds.append({**told, "energy": -gained})
@@ -150,6 +156,20 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
             break
         motions = settle_types(judge, best[1], config.compare_types_below, config.freedom_penalty)
     return motions, rounds
+
+
+def settled(
+    judge: Judge, motions: PartMotions, config: PartMotionsConfig, anew: bool
+) -> tuple[int, float, PartMotions] | None:
+    """The motions with islands settled, of these labels or of labels chosen ``anew``, and refined: how many islands,
+    the image loss, the motions; None where no label changes."""
+    tried = relabelled(judge.found, judge.states, motions) if anew else motions
+    gaussians = [s.gaussians for s in judge.states]
+    labels, count = settle_islands(gaussians, tried.labels, tried.transforms, config.islands)
+    if all(map(torch.equal, labels, motions.labels)):
+        return None
+    _, reached, tried = judge.improved(replace(tried, labels=labels))
+    return count, reached, tried
 
 
 def drop_unfounded(judge: Judge, motions: PartMotions, least: float) -> tuple[PartMotions, list[dict]]:

@@ -85,3 +85,15 @@ def test_what_hides_its_own_pixels_does_not_win_by_that():
     assert judge.gain(true, false) > 0.4
     assert judge.no_worse(true, false).transforms[0].equal(true.transforms[0])
     assert judge.no_worse(false, true).transforms[0].equal(true.transforms[0])
+
+
+def test_answers_are_the_same_bits_for_any_number_of_threads():
+    answers = []
+    for count in (1, 2):
+        torch.set_num_threads(count)
+        judge, true, false = panels()
+        judge.config = replace(CONFIG, steps=4)
+        refined = judge.refine(false)
+        answers.append((judge.gain(true, false), judge.own_share(true, false), refined.transforms.tolist()))
+        assert torch.get_num_threads() == count
+    assert answers[0] == answers[1]

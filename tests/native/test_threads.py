@@ -1,9 +1,12 @@
 """Whose threads work: torch's own or the kernels'."""
 
+import threading
+from functools import partial
+
 import pytest
 import torch
 
-from p2gs.native import num_threads, serial_torch
+from p2gs.native import at_once, num_threads, serial_torch
 
 
 def threads_now():
@@ -31,3 +34,29 @@ def test_switched_off():
     torch.set_num_threads(2)
     with serial_torch(on=False):
         assert threads_now() == (2, 2)
+
+
+def test_jobs_at_once_have_a_thread_each_and_answer_in_order():
+    torch.set_num_threads(2)
+    met = threading.Barrier(2, timeout=20)  # a job alone would wait in vain
+
+    def job(number):
+        met.wait()
+        return number, threads_now(), torch.is_grad_enabled(), at_once([threads_now])
+
+    with torch.no_grad():
+        done = at_once([partial(job, number) for number in range(4)])
+    assert done == [(number, (1, 1), False, [(1, 1)]) for number in range(4)]
+    assert threads_now() == (2, 2)
+
+
+def test_jobs_at_once_are_ones_own_with_one_thread():
+    torch.set_num_threads(1)
+    assert at_once([threading.get_ident] * 3) == [threading.get_ident()] * 3
+
+
+def test_an_error_of_a_job_is_raised_and_threads_are_given_back():
+    torch.set_num_threads(2)
+    with pytest.raises(ZeroDivisionError):
+        at_once([lambda: 1, lambda: 1 // 0])
+    assert threads_now() == (2, 2) and at_once([lambda: 1, lambda: 2]) == [1, 2]

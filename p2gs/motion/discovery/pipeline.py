@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from functools import partial
 from typing import Callable, Optional
 
 import numpy as np
@@ -24,6 +25,7 @@ from p2gs.motion.discovery.rigid import Motions, axes_used, without
 from p2gs.motion.discovery.rows import rows
 from p2gs.motion.discovery.search import ExclusiveGain, Search, two_sided
 from p2gs.motion.discovery.verify import image_score, violation
+from p2gs.native import at_once
 from p2gs.ops import se3
 from p2gs.types import UserError
 from p2gs.visibility.depth_stack import StateEvidence
@@ -69,22 +71,18 @@ def discover(
         sets: list[Motions] = []
         searches = max(config.searches, 1)
         figures |= {"axes": axes.tolist(), "search": []}
-        for number in range(searches):
-            looked = problem if number == 0 else resampled(problem, seed + number)
-            swept = sweep(looked, axes)
-            one = Search(looked, swept, most, config.part_cost)
-            search = search or one
-            solutions = one.solve()
-            solutions += one.alternatives(solutions)
-            found = [one.pool.motions[torch.tensor(chosen)] for value, chosen in solutions if value > 0 and chosen]
+        looks = [problem, *(resampled(problem, seed + number) for number in range(1, searches))]
+        done = at_once([partial(searched, looked, axes, most) for looked in looks])
+        search = done[0][0]
+        for one, found in done:
             sets += [f for f in found[: config.candidates] if not any(search.agree(f, other) for other in sets)]
-            tell("selection", 0.2 + 0.5 * (number + 1) / searches)
-            figures["search"].append({"motions_tried": len(swept.motions), **one.trace[-1]} if one.trace else {})
+            tried = {"motions_tried": len(one.swept.motions)}
+            figures["search"].append({**tried, **one.trace[-1]} if one.trace else {})
         lap("selection", 0.7)
-        explanations = [finish(problem, graphs, motions, limit, still) for motions in sets]
+        explanations = at_once([partial(finish, problem, graphs, motions, limit, still) for motions in sets])
         explanations += again(problem, graphs, search, explanations, limit, still)
         explanations = ranked(search, explanations)
-        best = [divided(problem, graphs, e, limit, still) for e in explanations[: config.candidates]]
+        best = at_once([partial(divided, problem, graphs, e, limit, still) for e in explanations[: config.candidates]])
         explanations = ranked(search, best + explanations[config.candidates :])
         lap("labels", 0.95)
     if not explanations:
@@ -117,6 +115,15 @@ def discover(
     ]
     lap("description", 1.0)
     return out
+
+
+def searched(problem: Problem, axes: Tensor, limit: int) -> tuple[Search, list[Motions]]:
+    """A search among all motions about ``axes`` [D, 3], and the sets of motions that it found, best first."""
+    search = Search(problem, sweep(problem, axes), limit, problem.config.part_cost)
+    solutions = search.solve()
+    solutions += search.alternatives(solutions)
+    found = [search.pool.motions[torch.tensor(chosen)] for value, chosen in solutions if value > 0 and chosen]
+    return search, found
 
 
 def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate:
