@@ -109,7 +109,7 @@ def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say)
         return explanations, []
     say(f"a quick look at {len(explanations)} explanations")
     quick = judge.at_a_glance(config.look_steps)
-    looks = at_once([lambda e=e: quick(quick.refine(_label_states(e, judge.states)))[0] for e in explanations])
+    looks = at_once(lambda e: quick(quick.refine(_label_states(e, judge.states)))[0], explanations)
     order = sorted(range(len(explanations)), key=looks.__getitem__)[: max(config.candidates, 1)]
     return [explanations[i] for i in order], looks
 
@@ -120,13 +120,13 @@ def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) 
     if len(explanations) > 1:
         say(f"re-rendering {len(explanations)} explanations")
 
-    def one(explanation) -> tuple[PartMotions, dict]:
+    def simplified(explanation) -> tuple[PartMotions, dict]:
         reductions: list[dict] = []
         better = judge.improved(_label_states(explanation, judge.states))[2]
         motions = simplify(judge, better, config.same_motion, reductions)
         return motions, {"types": motions.types, "cost": judge.cost(motions), "reductions": reductions}
 
-    looked, chosen = at_once([partial(one, e) for e in explanations]), 0
+    looked, chosen = at_once(simplified, explanations), 0
     refined, tried = [motions for motions, _ in looked], [told for _, told in looked]
     for number, motions in enumerate(refined):
         if judge.gain(motions, refined[chosen]) > 0:

@@ -94,7 +94,7 @@ def single_ways(
     short = replace(config, steps=max(config.steps // 3, 1), rate=config.rate / 2)
     sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
     options = {"seed": seed, "backend": backend, "device": device}
-    found = at_once([partial(polish, [side], motions.transforms, motions.types, short, **options) for side in sides])
+    found = at_once(lambda side: polish([side], motions.transforms, motions.types, short, **options), sides)
     return {name: T for name, (T, _) in zip(("forward", "backward"), found, strict=True)}
 
 
@@ -126,7 +126,7 @@ def explanation_cost(
         there = {"shown": seen[1 - s].pixels, "hidden": HIDDEN}
         return photometric_cost(states[s].gaussians, labels, ways[s], views[1 - s], **there, **options)
 
-    return 0.5 * sum(at_once([partial(one_way, s) for s in (0, 1)]))
+    return 0.5 * sum(at_once(one_way, (0, 1)))
 
 
 @dataclass
@@ -169,12 +169,12 @@ class Judge:
 
     def seen(self, motions: PartMotions) -> list[Seen]:
         """What counts under these motions (``what_counts``)."""
-        for m, seen in self.looked:
-            if m is motions:
-                return seen
-        options = {"backend": self.backend, "device": self.device}
-        seen = what_counts(self.states, motions, self.config, self.stacks, **options)
-        self.looked = [*self.looked[1 - LOOKED :], (motions, seen)]
+        seen = next((seen for m, seen in self.looked if m is motions), None)
+        if seen is None:
+            options = {"backend": self.backend, "device": self.device}
+            seen = what_counts(self.states, motions, self.config, self.stacks, **options)
+        others = [known for known in self.looked if known[0] is not motions]
+        self.looked = [*others[1 - LOOKED :], (motions, seen)]
         return seen
 
     def cost(self, motions: PartMotions, by: PartMotions | None = None) -> float:
@@ -195,7 +195,7 @@ class Judge:
         def ratio(by: PartMotions) -> float:
             return max(self.cost(than, by), 1e-9) / max(self.cost(tried, by), 1e-9)
 
-        return 0.5 * sum(map(math.log, at_once([partial(ratio, by) for by in (tried, than)])))
+        return 0.5 * sum(map(math.log, at_once(ratio, (tried, than))))
 
     def own_share(self, tried: PartMotions, than: PartMotions) -> float:
         """Share of the image loss that ``tried`` saves against ``than`` (-inf..1), each pixel weighted by how far their
@@ -204,7 +204,8 @@ class Judge:
         Of the whole image a small part saves little however right it is; this is alike for parts of any size.
         """
 
-        def one_way(s: int, seen: list[Seen]) -> Tensor:
+        def one_way(asked: tuple[int, list[Seen]]) -> Tensor:
+            s, seen = asked
             ways = [se3.inverse(m.transforms) if s else m.transforms for m in (tried, than)]
             drawn = [torch.where(seen[s].kept, m.labels[s], -1) for m in (tried, than)]
             return image_losses(
@@ -218,7 +219,7 @@ class Judge:
             )
 
         both = [self.seen(tried), self.seen(than)]
-        lost = torch.stack(at_once([partial(one_way, s, seen) for s in (0, 1) for seen in both])).sum(0)
+        lost = torch.stack(at_once(one_way, [(s, seen) for s in (0, 1) for seen in both])).sum(0)
         return float(1 - lost[0] / lost[1]) if float(lost[1]) > 0 else 0.0
 
     def gain(self, tried: PartMotions, than: PartMotions) -> float:
@@ -278,4 +279,4 @@ def what_counts(
         kept, shown = kept_and_shown(states, motions, s, stacks, config)
         return Seen(kept, ShownPixels(states[s], shown | ~kept, backend, device))
 
-    return at_once([partial(of, s) for s in (0, 1)])
+    return at_once(of, (0, 1))

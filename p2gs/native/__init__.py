@@ -34,9 +34,18 @@ if native is not None:
         raise UserError(f"P2GS_ISA={_wanted} is not among what this machine runs: {', '.join(native.available_isas())}")
 
 
+S = TypeVar("S")
 T = TypeVar("T")
 _kernel_threads: Optional[int] = None  # inside serial_torch: what torch had
-_job = threading.local()  # its ``alone`` is True on threads of at_once
+
+
+class _Thread(threading.local):
+    """alone: is this a thread of ``at_once``?"""
+
+    alone = False
+
+
+_this = _Thread()
 
 
 def num_threads() -> int:
@@ -44,11 +53,12 @@ def num_threads() -> int:
     ``serial_torch`` those it had, inside ``at_once`` one."""
     import torch
 
-    return 1 if getattr(_job, "alone", False) else _kernel_threads or torch.get_num_threads()
+    return 1 if _this.alone else _kernel_threads or torch.get_num_threads()
 
 
-def at_once(jobs: Sequence[Callable[[], T]]) -> list[T]:
-    """What ``jobs`` return, in their order, each on a thread of its own with kernels and torch on that one thread.
+def at_once(job: Callable[[S], T], items: Sequence[S]) -> list[T]:
+    """What ``job`` returns for each of ``items``, in their order, each on a thread of its own with kernels and torch on
+    that one thread.
 
     For jobs that do not wait for one another and change nothing that another one looks at: two of them on two cores
     take little longer than one, while one that shares its small operations out gains next to nothing. With one thread,
@@ -56,20 +66,20 @@ def at_once(jobs: Sequence[Callable[[], T]]) -> list[T]:
     """
     import torch
 
-    threads = min(num_threads(), len(jobs))
+    threads = min(num_threads(), len(items))
     if threads < 2:
-        return [job() for job in jobs]
+        return [job(item) for item in items]
     before, grad = torch.get_num_threads(), torch.is_grad_enabled()
 
-    def run(job: Callable[[], T]) -> T:
-        _job.alone = True
+    def run(item: S) -> T:
+        _this.alone = True
         torch.set_num_threads(1)
         with torch.set_grad_enabled(grad):
-            return job()
+            return job(item)
 
     try:
         with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(run, jobs))
+            return list(pool.map(run, items))
     finally:
         torch.set_num_threads(before)
 
@@ -85,7 +95,7 @@ def serial_torch(on: bool = True) -> Iterator[None]:
     import torch
 
     global _kernel_threads
-    if not on or native is None or _kernel_threads is not None or getattr(_job, "alone", False):
+    if not on or native is None or _kernel_threads is not None or _this.alone:
         yield
         return
     before = torch.get_num_threads()

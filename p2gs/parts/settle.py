@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 
 import torch
 from torch import Tensor
@@ -58,12 +59,12 @@ def reconsider(
             in_row = in_rows(found, motions.transforms, motions.types, directions_of(states, motions), limit)
             tries["in a row"] = _proposed(found, states, motions, [(0, *row) for row in in_row])
         best = None
-        kinds = [change for change, proposed in tries.items() if proposed]
-        jobs = [partial(_best_refined, judge, motions, tries[change], config.candidates) for change in kinds]
-        for change, (part, tried, refined) in zip(kinds, at_once(jobs), strict=True):
-            gained, reached = judge.gain(refined, motions), judge.cost(refined)
-            log.append({"change": change, "part": part, "type": tried.types[part], "cost": cost, "after": reached})
-            log[-1] |= {"proposed": -judge.gain(tried, motions), "energy": -gained}
+        tries = {change: proposed for change, proposed in tries.items() if proposed}
+        done = at_once(partial(_best_refined, judge, motions, config.candidates), list(tries.values()))
+        for change, (part, proposed, gained, refined) in zip(tries, done, strict=True):
+            reached = judge.cost(refined)
+            log.append({"change": change, "part": part, "type": refined.types[part], "cost": cost, "after": reached})
+            log[-1] |= {"proposed": -proposed, "energy": -gained}
             new = part if len(refined) == len(motions) else len(motions)
             better = gained > (0 if best is None else best[0])
             if better and lonely(states, refined, motions, new):
@@ -78,13 +79,14 @@ def reconsider(
 
 
 def _best_refined(
-    judge: Judge, motions: PartMotions, proposed: list[tuple[int, PartMotions]], count: int
-) -> tuple[int, PartMotions, PartMotions]:
-    """Of the ``count`` proposals (part, motions) that surfaces like best the one of least energy: its part, its motions
-    and these refined."""
+    judge: Judge, motions: PartMotions, count: int, proposed: list[tuple[int, PartMotions]]
+) -> tuple[int, float, float, PartMotions]:
+    """Of the ``count`` proposals (part, motions) that surfaces like best the one of least energy: its part, what it
+    gains against ``motions``, what it gains refined, and the motions refined."""
     proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[:count]
-    part, tried = max(proposed, key=lambda p: judge.gain(p[1], motions))
-    return part, tried, judge.improved(tried)[2]
+    gain, (part, tried) = max(((judge.gain(p[1], motions), p) for p in proposed), key=itemgetter(0))
+    refined = judge.improved(tried)[2]
+    return part, gain, judge.gain(refined, motions), refined
 
 
 def _with_part(found: Discovery, states, motions: PartMotions, part: int | None) -> list[PartMotions]:
@@ -140,14 +142,13 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
     rounds = []
     for number in range(config.rounds if len(motions) else 0):
         cost, best = judge.cost(motions), None
-        jobs = [partial(settled, judge, motions, config, anew) for anew in (False, True)]
         # amid a wrong explanation's labels the larger pieces need not be the right ones: islands are settled only from
         # here on
-        for name, done in zip(("kept", "anew"), at_once(jobs), strict=True):
+        both = at_once(partial(_settled, judge, motions, config), (False, True))
+        for name, done in zip(("kept", "anew"), both, strict=True):
             if done is None:
                 continue
-            count, reached, tried = done
-            gained = judge.gain(tried, motions)
+            count, reached, gained, tried = done
             told = {"round": number, "labels": name, "islands": count, "before": cost, "after": reached}
             rounds.append({**told, "energy": -gained})
             if best is None or gained > best[0]:
@@ -158,18 +159,18 @@ def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig)
     return motions, rounds
 
 
-def settled(
+def _settled(
     judge: Judge, motions: PartMotions, config: PartMotionsConfig, anew: bool
-) -> tuple[int, float, PartMotions] | None:
+) -> tuple[int, float, float, PartMotions] | None:
     """The motions with islands settled, of these labels or of labels chosen ``anew``, and refined: how many islands,
-    the image loss, the motions; None where no label changes."""
+    the image loss, what they gain, the motions; None where no label changes."""
     tried = relabelled(judge.found, judge.states, motions) if anew else motions
     gaussians = [s.gaussians for s in judge.states]
     labels, count = settle_islands(gaussians, tried.labels, tried.transforms, config.islands)
     if all(map(torch.equal, labels, motions.labels)):
         return None
     _, reached, tried = judge.improved(replace(tried, labels=labels))
-    return count, reached, tried
+    return count, reached, judge.gain(tried, motions), tried
 
 
 def drop_unfounded(judge: Judge, motions: PartMotions, least: float) -> tuple[PartMotions, list[dict]]:

@@ -1,7 +1,6 @@
 """Whose threads work: torch's own or the kernels'."""
 
 import threading
-from functools import partial
 
 import pytest
 import torch
@@ -42,21 +41,21 @@ def test_jobs_at_once_have_a_thread_each_and_answer_in_order():
 
     def job(number):
         met.wait()
-        return number, threads_now(), torch.is_grad_enabled(), at_once([threads_now])
+        return number, threads_now(), torch.is_grad_enabled(), at_once(lambda _: threads_now(), [0])
 
     with torch.no_grad():
-        done = at_once([partial(job, number) for number in range(4)])
+        done = at_once(job, range(4))
     assert done == [(number, (1, 1), False, [(1, 1)]) for number in range(4)]
     assert threads_now() == (2, 2)
 
 
 def test_jobs_at_once_are_ones_own_with_one_thread():
     torch.set_num_threads(1)
-    assert at_once([threading.get_ident] * 3) == [threading.get_ident()] * 3
+    assert at_once(lambda _: threading.get_ident(), range(3)) == [threading.get_ident()] * 3
 
 
 def test_an_error_of_a_job_is_raised_and_threads_are_given_back():
     torch.set_num_threads(2)
     with pytest.raises(ZeroDivisionError):
-        at_once([lambda: 1, lambda: 1 // 0])
-    assert threads_now() == (2, 2) and at_once([lambda: 1, lambda: 2]) == [1, 2]
+        at_once(lambda n: 1 // n, [1, 0])
+    assert threads_now() == (2, 2) and at_once(lambda n: n, [1, 2]) == [1, 2]

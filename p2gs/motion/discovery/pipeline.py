@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from functools import partial
 from typing import Callable, Optional
 
 import numpy as np
@@ -69,20 +68,19 @@ def discover(
         axes, still = directions(problem), static_axes(problem)
         most = max(limit, config.max_parts - 1)  # a bound cuts what is found, not the search
         sets: list[Motions] = []
-        searches = max(config.searches, 1)
         figures |= {"axes": axes.tolist(), "search": []}
-        looks = [problem, *(resampled(problem, seed + number) for number in range(1, searches))]
-        done = at_once([partial(searched, looked, axes, most) for looked in looks])
+        looks = [problem, *(resampled(problem, seed + number) for number in range(1, config.searches))]
+        done = at_once(lambda looked: searched(looked, axes, most), looks)
         search = done[0][0]
         for one, found in done:
             sets += [f for f in found[: config.candidates] if not any(search.agree(f, other) for other in sets)]
             tried = {"motions_tried": len(one.swept.motions)}
             figures["search"].append({**tried, **one.trace[-1]} if one.trace else {})
         lap("selection", 0.7)
-        explanations = at_once([partial(finish, problem, graphs, motions, limit, still) for motions in sets])
+        explanations = at_once(lambda motions: finish(problem, graphs, motions, limit, still), sets)
         explanations += again(problem, graphs, search, explanations, limit, still)
         explanations = ranked(search, explanations)
-        best = at_once([partial(divided, problem, graphs, e, limit, still) for e in explanations[: config.candidates]])
+        best = at_once(lambda e: divided(problem, graphs, e, limit, still), explanations[: config.candidates])
         explanations = ranked(search, best + explanations[config.candidates :])
         lap("labels", 0.95)
     if not explanations:
