@@ -9,7 +9,7 @@ namespace p2gs {
 // points to pixels times depth.
 struct FuseView {
     const float *depth, *dot, *cosine, *colour;
-    const int64_t* label;
+    const int16_t* label;
     float to_pixel[12];
     int32_t width, height;
 };

@@ -51,10 +51,10 @@ class Cells:
 
     @staticmethod
     def around(
-        points: np.ndarray, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float
+        points: Sequence[Tensor], views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float
     ) -> "Cells":
-        """Those near points [N, 3], by all views of a part (as in ``tsdf.fuse``)."""
-        grid = ActiveGrid.around(torch.as_tensor(points), voxel)
+        """Those near points [n, 3] each, by all views of a part (as in ``tsdf.fuse``)."""
+        grid = ActiveGrid.around(points, voxel)
         matrices = [pixel_matrix(v.camera, T) for v, T in zip(views, poses, strict=True)]
         field, sighted, _, weight = integrate(grid.centers(), views, matrices, part, TRUNCATION * voxel, BEHIND * voxel)
         at = tuple(grid.index.T.numpy())
@@ -88,8 +88,8 @@ def close(seen: Mesh, done: Mesh, views: Sequence[DepthView], poses: Sequence[Te
     if not len(done.faces):
         return Mesh.empty()
     kept, made = points_on(seen, voxel), points_on(done, voxel)
-    points = [seen_points(v, part, T).numpy() for v, T in zip(views, poses, strict=True)]
-    cells = Cells.around(np.concatenate([*points, made]), views, poses, part, voxel)
+    points = [seen_points(v, part, T) for v, T in zip(views, poses, strict=True)]
+    cells = Cells.around([*points, torch.as_tensor(made)], views, poses, part, voxel)
     before, after = cells.holding(kept), cells.holding(made)
     beside = _within(before, BESIDE)
     guess = after & (~beside | (cells.sighted == 0))  # up to the seen surface, without a gap

@@ -21,7 +21,7 @@ def integrate(
     """Signed distance in units of trunc [n], weight of surface sightings [n], colour [n, 3] and weight of all that the
     distance is the mean of [n], at points [n, 3] float32.
 
-    views: with normals, float32 maps and int64 labels, all on the CPU.  matrices: ``pixel_matrix`` of each.  part: in
+    views: with normals, float32 maps and int16 labels, all on the CPU.  matrices: ``pixel_matrix`` of each.  part: in
     ``views``.
     trunc: distance in front of the surface at which space counts as free.  behind: how far behind the surface it still
     counts. The same bits for any number of threads.  Raises ValueError for a view without normals or with maps of other
@@ -42,7 +42,7 @@ def integrate(
         depth, dot, cosine, colour = (
             m.float().contiguous() for m in (view.depth, view.normal_dot, view.cosine, view.colour)
         )
-        kept.append((depth, view.labels.long().contiguous(), dot, cosine, colour))
+        kept.append((depth, view.labels.short().contiguous(), dot, cosine, colour))
         rows.append([m.data_ptr() for m in kept[-1]] + [view.camera.width, view.camera.height])
     points, n = points.float().contiguous(), len(points)
     out = [torch.empty(n), torch.empty(n), torch.empty(n, 3), torch.empty(n)]

@@ -26,6 +26,7 @@ FIRM = 0.8  # opacity a ray must meet to count as a sighting of surface
 FOG = 2.5  # times the usual spread of depth along a ray: what is more is fog
 NEAR = 0.02  # of the object's longest side: see look and fog_limit
 EDGE, TRUNCATION, BEHIND = 2.0, 4.0, 2.0  # voxels: see tsdf.add_normals and tsdf.fuse
+FINEST = 2.0  # pixels a voxel, at the object's middle: a field of voxels holds no finer detail (two samples each)
 
 
 def start_motion(obj: ArticulatedObject, part: int, t: float) -> Tensor:
@@ -35,7 +36,7 @@ def start_motion(obj: ArticulatedObject, part: int, t: float) -> Tensor:
 
 @dataclass
 class PartView:
-    """What a camera sees of a twin. depth [H, W] along z, 0 where little is hit.  label [H, W] int64: the part that
+    """What a camera sees of a twin. depth [H, W] along z, 0 where little is hit.  label [H, W] int16: the part that
     covers most of a pixel, -1 where little is hit.  colour [H, W, 3] in 0..1.  alpha [H, W].  spread [H, W]: see
     ``surface_depth``."""
 
@@ -63,7 +64,7 @@ def look(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera, nea
     alpha = out.alpha.clamp_min(1e-3)
     return PartView(
         depth=torch.where(solid, torch.where((depth > 0) & (spread < near), depth, median), torch.zeros_like(depth)),
-        label=torch.where(solid, likeliest(torch.cat(shares, -1).flatten(0, 1)).reshape(solid.shape), -1),
+        label=torch.where(solid, likeliest(torch.cat(shares, -1).flatten(0, 1)).reshape(solid.shape), -1).short(),
         colour=(out.colour / alpha[..., None]).clamp(0, 1),
         alpha=out.alpha,
         spread=spread,
@@ -114,9 +115,21 @@ class Sightings:
         return find_tray(mesh, body, self.motions[k][1].numpy(), eyes_of(self.views, self.poses[k]), self.voxel)
 
 
-def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION) -> Sightings:
+def no_finer(cameras: Sequence[tuple[int, Camera]], middle: Tensor, voxel: float) -> list[tuple[int, Camera]]:
+    """The cameras with smaller images, all by one factor, where even the coarsest draws more than ``FINEST`` pixels a
+    voxel at ``middle`` [3]: photographs of 800 pixels and more would take gigabytes."""
+    spans = [float(c.K[:2, :2].diagonal().min() * voxel / (c.position - middle).norm()) for _, c in cameras]
+    factor = FINEST / max(min(spans, default=0.0), FINEST)
+    if factor == 1.0:
+        return list(cameras)
+    return [(s, c.scaled(max(round(factor * c.width), 1), max(round(factor * c.height), 1))) for s, c in cameras]
+
+
+def sight(
+    obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolution: int = RESOLUTION, fine: bool = False
+) -> Sightings:
     """Look at the parts. obj and cameras ((state, camera) pairs) in one coordinate system. resolution: as in
-    ``part_meshes``."""
+    ``part_meshes``. fine: in all pixels of the cameras, even where a voxel has many."""
     lo, hi = bounds(obj, (0.0,))
     size = float((hi - lo).max())
     voxel = size / resolution
@@ -124,12 +137,16 @@ def sight(obj: ArticulatedObject, cameras: Sequence[tuple[int, Camera]], resolut
     for k, part in enumerate(obj.parts):
         index[part.id] = k
     posed = [pose(obj, 0.0), pose(obj, 1.0)]
+    if not fine:
+        cameras = no_finer(cameras, (lo + hi) / 2, voxel)
     looks = [
         look(posed[state], index[obj.part_ids], len(obj.parts), camera, near=NEAR * size) for state, camera in cameras
     ]
     limit = fog_limit(looks, size)
-    views = []
-    for seen, (_, camera) in zip(looks, cameras, strict=True):
+    views: list[DepthView] = []
+    looks.reverse()
+    for _, camera in cameras:
+        seen = looks.pop()  # not kept beside its view: together they are much of what a run has in memory
         view = add_normals(DepthView(camera, seen.depth, seen.label, seen.colour), edge=EDGE * voxel)
         assert view.cosine is not None  # of add_normals
         view.cosine = view.cosine * trust(seen, limit) * ~beside_others(seen.label)

@@ -114,7 +114,7 @@ class Baker:
         obj = load_twin(run_dir)
         self.place = {part.id: k for k, part in enumerate(obj.parts)}
         with rasterizer_of(run_dir):
-            self.seen = sight(obj, mesh_cameras(obj, read_cameras(Path(run_dir) / "cameras.json")))
+            self.seen = sight(obj, mesh_cameras(obj, read_cameras(Path(run_dir) / "cameras.json")), fine=True)
         self.done: dict[int, Texture] = {}
 
     def __call__(self, part: int, mesh: Mesh) -> Texture:

@@ -33,8 +33,7 @@ def fuse(
     (keeps thin panels apart).
     """
     points = [seen_points(v, part, T) for v, T in zip(views, poses, strict=True)]
-    points = torch.cat(points)
-    if len(points) < 50:
+    if sum(map(len, points)) < 50:
         return Mesh.empty()
     grid = ActiveGrid.around(points, voxel)
     matrices = [pixel_matrix(v.camera, T) for v, T in zip(views, poses, strict=True)]
@@ -52,14 +51,20 @@ class ActiveGrid:
     index: Tensor
 
     @staticmethod
-    def around(points: Tensor, voxel: float) -> "ActiveGrid":
-        """All voxels of the blocks that hold a point, and of the blocks beside them."""
+    def around(points: Sequence[Tensor], voxel: float) -> "ActiveGrid":
+        """All voxels of the blocks that hold a point, and of the blocks beside them. points [n, 3] each, in some of
+        them one at least."""
         side = BLOCK * voxel
-        lo = points.amin(0) - 1.5 * side
-        blocks = ((points - lo) / side).floor().long()
-        dims = (blocks.amax(0) + 2).tolist()
+        points = [p for p in points if len(p)]
+        lo = torch.stack([p.amin(0) for p in points]).amin(0) - 1.5 * side
+
+        def block(p: Tensor) -> Tensor:
+            return ((p - lo) / side).floor().long()
+
+        dims = (block(torch.stack([p.amax(0) for p in points]).amax(0)) + 2).tolist()
         hit = torch.zeros(dims, dtype=torch.float32)
-        hit[blocks[:, 0], blocks[:, 1], blocks[:, 2]] = 1
+        for p in points:  # one view's at a time: all together are the most that a run has in memory
+            hit[block(p).unbind(1)] = 1
         grown = torch.nn.functional.max_pool3d(hit[None, None], 3, stride=1, padding=1)[0, 0]
         blocks = grown.nonzero()
         inner = torch.stack(torch.meshgrid(*(torch.arange(BLOCK),) * 3, indexing="ij"), -1).reshape(-1, 3)

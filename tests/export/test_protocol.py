@@ -1,12 +1,13 @@
 """The surfaces that ArtGS's protocol scores: nothing completed, the whole by itself, moving parts cleaned of stray
 Gaussians."""
 
+import numpy as np
 import pytest
 import trimesh
 from toy import toy_scene, toy_twin
 
 from p2gs.export.run_folder import write_twin
-from p2gs.gaussians.views import scene_cameras
+from p2gs.gaussians.views import bounds, scene_cameras
 from p2gs.ops.mesh import Mesh
 from p2gs.scores.evaluate import surface_scores
 from p2gs.surface.mesh import part_meshes, read_mesh, write_meshes
@@ -39,6 +40,22 @@ def test_a_moving_part_keeps_its_largest_cluster():
     assert (
         int((kept.part_ids == part.id).sum()) == len(mine) - 2 and kept.gaussians.means[kept.part_ids == 0].max() > 40
     )
+
+
+def test_large_photographs_are_looked_at_no_finer_than_voxels_ask():
+    """Four times the edge: views have two pixels a voxel where the coarsest camera looks, and the same surfaces."""
+    twin = toy_twin()
+    cameras = [(c.state, c.camera.scaled(4 * c.camera.width, 4 * c.camera.height)) for c in scene_cameras(toy_scene())]
+    seen, fine = sight(twin, cameras, 40), sight(twin, cameras, 40, fine=True)
+    assert [v.camera for v in fine.views] == [c for _, c in cameras]
+    assert all(v.depth.shape == (v.camera.height, v.camera.width) for v in seen.views)
+    lo, hi = bounds(twin, (0.0,))
+    finest = [float(v.camera.K[0, 0] * seen.voxel / (v.camera.position - (lo + hi) / 2).norm()) for v in seen.views]
+    assert min(finest) == pytest.approx(2, rel=0.02)
+    for k in range(len(twin.parts)):
+        ours, theirs = (trimesh.Trimesh(s.surface(k).vertices, s.surface(k).faces) for s in (seen, fine))
+        assert 0.75 * theirs.area < ours.area < 1.05 * theirs.area  # borders, a pixel wide, are no sightings
+        assert np.quantile(trimesh.proximity.closest_point(theirs, ours.vertices)[1], 0.98) < seen.voxel
 
 
 def test_nothing_is_completed_where_it_is_not_wanted():
