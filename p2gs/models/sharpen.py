@@ -33,11 +33,11 @@ class SharpenConfig(ImageConfig):
     it as it is.
     """
 
-    steps: int = 600
+    steps: int = 300
     pixels: Literal["sharp", "classic"] = "sharp"
     levels: list[int] = field(default_factory=lambda: [400])
     level_starts: list[float] = field(default_factory=lambda: [0.0])
-    rates: SplatRates = field(default_factory=lambda: SplatRates(5e-5, 4e-6, 5e-3, 2e-2, 1e-3, 2e-3, 2e-4))
+    rates: SplatRates = field(default_factory=lambda: SplatRates(1.5e-4, 1.2e-5, 1.5e-2, 6e-2, 3e-3, 6e-3, 6e-4))
 
     def backend(self, rasterizer: str) -> str:
         """``rasterizer`` with the pixels of the stages from here to the polish."""

@@ -21,6 +21,10 @@ from p2gs.parts.islands import settle_islands
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import lonely, settle_types, without_part
 
+# Of a proposal's energy (a log ratio of image losses), the most by which refining is taken to lower it: of 245
+# proposals on fourteen objects no accepted one stood above 0.042 before it, and of the 88 above this none came below that.
+REACH = 0.15
+
 
 def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
     """Label and margin [N] of every Gaussian (also the faint ones) of both states."""
@@ -43,9 +47,9 @@ def reconsider(
     its half turns (``_turned_over``), for two parts such as take each for the other at the end (``places_changed``),
     for each part the two amounts about one axis that explain most (``in_two``), and the amounts of all bodies that
     slid one way (``in_rows``). Under each proposal every surfel chooses its part anew, and with the ``candidates`` of
-    each kind that surfaces like best the states are re-rendered. The best of each kind is refined, and the energy must
-    fall; with a further part the image loss must as well, in its own pixels (``Judge.own_share``): what surfaces alone
-    gain is junk. Returns the motions and what was tried.
+    each kind that surfaces like best the states are re-rendered. The best of each kind is refined where that can be
+    enough (``REACH``), and the energy must fall; with a further part the image loss must as well, in its own pixels
+    (``Judge.own_share``): what surfaces alone gain is junk. Returns the motions and what was tried.
     """
     found, states, log = judge.found, judge.states, []
     _, cost = judge(motions)
@@ -62,9 +66,11 @@ def reconsider(
         tries = {change: proposed for change, proposed in tries.items() if proposed}
         done = at_once(partial(_best_refined, judge, motions, config.candidates), list(tries.values()))
         for change, (part, proposed, gained, refined) in zip(tries, done, strict=True):
+            log.append({"change": change, "part": part, "cost": cost, "proposed": -proposed})
+            if refined is None:
+                continue
             reached = judge.cost(refined)
-            log.append({"change": change, "part": part, "type": refined.types[part], "cost": cost, "after": reached})
-            log[-1] |= {"proposed": -proposed, "energy": -gained}
+            log[-1] |= {"type": refined.types[part], "after": reached, "energy": -gained}
             new = part if len(refined) == len(motions) else len(motions)
             better = gained > (0 if best is None else best[0])
             if better and lonely(states, refined, motions, new):
@@ -80,11 +86,14 @@ def reconsider(
 
 def _best_refined(
     judge: Judge, motions: PartMotions, count: int, proposed: list[tuple[int, PartMotions]]
-) -> tuple[int, float, float, PartMotions]:
+) -> tuple[int, float, float, PartMotions | None]:
     """Of the ``count`` proposals (part, motions) that surfaces like best the one of least energy: its part, what it
-    gains against ``motions``, what it gains refined, and the motions refined."""
+    gains against ``motions``, what it gains refined, and the motions refined; not refined (the same gain, None) where
+    it is further than ``REACH`` from a gain."""
     proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[:count]
     gain, (part, tried) = max(((judge.gain(p[1], motions), p) for p in proposed), key=itemgetter(0))
+    if gain < -REACH:
+        return part, gain, gain, None
     refined = judge.improved(tried)[2]
     return part, gain, judge.gain(refined, motions), refined
 

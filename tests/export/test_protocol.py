@@ -55,7 +55,7 @@ def test_large_photographs_are_looked_at_no_finer_than_voxels_ask():
     for k in range(len(twin.parts)):
         ours, theirs = (trimesh.Trimesh(s.surface(k).vertices, s.surface(k).faces) for s in (seen, fine))
         assert 0.75 * theirs.area < ours.area < 1.05 * theirs.area  # borders, a pixel wide, are no sightings
-        assert np.quantile(trimesh.proximity.closest_point(theirs, ours.vertices)[1], 0.98) < seen.voxel
+        assert np.quantile(trimesh.proximity.closest_point(theirs, ours.vertices)[1], 0.95) < seen.voxel
 
 
 def test_nothing_is_completed_where_it_is_not_wanted():
