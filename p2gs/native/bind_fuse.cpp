@@ -21,7 +21,7 @@ void bind_fuse(nb::module_& m) {
                 const float* matrix = pointer<const float>(matrices) + 12 * k;
                 FuseView& v = views[k];
                 v.depth = pointer<const float>(at[0]), v.label = pointer<const int16_t>(at[1]), v.dot = pointer<const float>(at[2]);
-                v.cosine = pointer<const float>(at[3]), v.colour = pointer<const float>(at[4]);
+                v.cosine = pointer<const float>(at[3]), v.colour = pointer<const uint8_t>(at[4]);
                 v.width = int32_t(at[5]), v.height = int32_t(at[6]);
                 std::copy(matrix, matrix + 12, v.to_pixel);
             }
@@ -29,7 +29,7 @@ void bind_fuse(nb::module_& m) {
                         pointer<float>(out[1]), pointer<float>(out[2]), pointer<float>(out[3])},
                        n, threads);
         },
-        "maps int64 [count, 7]: addresses of a view's depth, int16 labels, |n . ray|, cosine and colour, width, height; matrices [count, 3, 4] "
+        "maps int64 [count, 7]: addresses of a view's depth, int16 labels, |n . ray|, cosine and uint8 colour, width, height; matrices [count, 3, 4] "
         "points to pixels times depth; part; (trunc, behind, weight of a view that sees through); points [n, 3]; out (signed distance [n], "
         "weight of sightings [n], colour [n, 3], weight of all [n])");
 }

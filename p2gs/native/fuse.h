@@ -8,7 +8,8 @@ namespace p2gs {
 // Pixels lie row by row. depth, label, dot and cosine [height, width], colour [height, width, 3]; to_pixel: rows of the matrix that takes
 // points to pixels times depth.
 struct FuseView {
-    const float *depth, *dot, *cosine, *colour;
+    const float *depth, *dot, *cosine;
+    const uint8_t* colour;
     const int16_t* label;
     float to_pixel[12];
     int32_t width, height;

@@ -16,8 +16,8 @@ from p2gs.types import Camera
 class DepthView:
     """What one view saw.
 
-    depth [H, W] along z, 0 where nothing was hit.  labels [H, W] int16 part id, -1 where nothing.  colour [H, W, 3] in
-    0..1.
+    depth [H, W] along z, 0 where nothing was hit.  labels [H, W] int16 part id, -1 where nothing.  colour [H, W, 3]
+    uint8.
     """
 
     camera: Camera

@@ -21,8 +21,8 @@ def integrate(
     """Signed distance in units of trunc [n], weight of surface sightings [n], colour [n, 3] and weight of all that the
     distance is the mean of [n], at points [n, 3] float32.
 
-    views: with normals, float32 maps and int16 labels, all on the CPU.  matrices: ``pixel_matrix`` of each.  part: in
-    ``views``.
+    views: with normals, float32 maps, int16 labels and uint8 colours, all on the CPU.  matrices: ``pixel_matrix`` of
+    each.  part: in ``views``.
     trunc: distance in front of the surface at which space counts as free.  behind: how far behind the surface it still
     counts. The same bits for any number of threads.  Raises ValueError for a view without normals or with maps of other
     shapes than its camera's.
@@ -30,19 +30,17 @@ def integrate(
     for view in views:
         shape = (view.camera.height, view.camera.width)
         maps = (view.depth, view.labels, view.normal_dot, view.cosine, view.colour)
-        if any(m is None for m in maps) or any(m.shape[:2] != shape for m in maps):
+        if any(m is None or m.shape[:2] != shape for m in maps) or view.colour.dtype != torch.uint8:
             raise ValueError(
-                f"a view of {shape[1]} x {shape[0]} pixels wants depth, labels, normal_dot, cosine and colour of "
-                "that size"
+                f"a view of {shape[1]} x {shape[0]} pixels wants depth, labels, normal_dot, cosine and uint8 colour "
+                "of that size"
             )
     if native is None:
         return integrate_reference(points, views, matrices, part, trunc, behind)
     kept, rows = [], []  # copies, where a view's maps are not contiguous, must outlive the call
     for view in views:
-        depth, dot, cosine, colour = (
-            m.float().contiguous() for m in (view.depth, view.normal_dot, view.cosine, view.colour)
-        )
-        kept.append((depth, view.labels.short().contiguous(), dot, cosine, colour))
+        depth, dot, cosine = (m.float().contiguous() for m in (view.depth, view.normal_dot, view.cosine))
+        kept.append((depth, view.labels.short().contiguous(), dot, cosine, view.colour.contiguous()))
         rows.append([m.data_ptr() for m in kept[-1]] + [view.camera.width, view.camera.height])
     points, n = points.float().contiguous(), len(points)
     out = [torch.empty(n), torch.empty(n), torch.empty(n, 3), torch.empty(n)]
@@ -73,7 +71,7 @@ def _pixel_table(view: DepthView, part: int) -> Tensor:
     depth = torch.where(view.labels < 0, torch.full_like(view.depth, 1e9), view.depth)
     cosine = torch.where(view.labels == part, view.cosine, torch.zeros_like(view.cosine))
     table = torch.cat(
-        [depth[..., None], view.normal_dot.clamp_min(0.05)[..., None], cosine[..., None], view.colour], -1
+        [depth[..., None], view.normal_dot.clamp_min(0.05)[..., None], cosine[..., None], view.colour / 255], -1
     ).reshape(-1, 6)
     return torch.cat([table, torch.tensor([[-1e9, 1.0, 0, 0, 0, 0]])])
 

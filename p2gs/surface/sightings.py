@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from dataclasses import dataclass
 from typing import Optional, Sequence
 
@@ -37,7 +38,7 @@ def start_motion(obj: ArticulatedObject, part: int, t: float) -> Tensor:
 @dataclass
 class PartView:
     """What a camera sees of a twin. depth [H, W] along z, 0 where little is hit.  label [H, W] int16: the part that
-    covers most of a pixel, -1 where little is hit.  colour [H, W, 3] in 0..1.  alpha [H, W].  spread [H, W]: see
+    covers most of a pixel, -1 where little is hit.  colour [H, W, 3] uint8.  alpha [H, W].  spread [H, W]: see
     ``surface_depth``."""
 
     depth: Tensor
@@ -65,7 +66,7 @@ def look(g: GaussianTensors, part_index: Tensor, parts: int, camera: Camera, nea
     return PartView(
         depth=torch.where(solid, torch.where((depth > 0) & (spread < near), depth, median), torch.zeros_like(depth)),
         label=torch.where(solid, likeliest(torch.cat(shares, -1).flatten(0, 1)).reshape(solid.shape), -1).short(),
-        colour=(out.colour / alpha[..., None]).clamp(0, 1),
+        colour=(out.colour / alpha[..., None]).clamp(0, 1).mul(255).round().byte(),
         alpha=out.alpha,
         spread=spread,
     )
@@ -116,10 +117,10 @@ class Sightings:
 
 
 def no_finer(cameras: Sequence[tuple[int, Camera]], middle: Tensor, voxel: float) -> list[tuple[int, Camera]]:
-    """The cameras with smaller images, all by one factor, where even the coarsest draws more than ``FINEST`` pixels a
-    voxel at ``middle`` [3]: photographs of 800 pixels and more would take gigabytes."""
+    """The cameras with smaller images, all by one factor, where most draw more than ``FINEST`` pixels a voxel at
+    ``middle`` [3]: photographs of 800 pixels and more would take gigabytes."""
     spans = [float(c.K[:2, :2].diagonal().min() * voxel / (c.position - middle).norm()) for _, c in cameras]
-    factor = FINEST / max(min(spans, default=0.0), FINEST)
+    factor = FINEST / max(statistics.median(spans or [0.0]), FINEST)
     if factor == 1.0:
         return list(cameras)
     return [(s, c.scaled(max(round(factor * c.width), 1), max(round(factor * c.height), 1))) for s, c in cameras]

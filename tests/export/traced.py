@@ -34,4 +34,4 @@ def seen(primitives, first, camera, edge) -> DepthView:
     hit = torch.from_numpy(np.isfinite(z))
     labels = torch.where(hit, torch.from_numpy(which >= first).long(), -1)
     depth = torch.where(hit, torch.from_numpy(z), torch.zeros(z.shape))
-    return add_normals(DepthView(camera, depth, labels, torch.full((*z.shape, 3), 0.5)), edge)
+    return add_normals(DepthView(camera, depth, labels, torch.full((*z.shape, 3), 128, dtype=torch.uint8)), edge)

@@ -24,7 +24,10 @@ def view(seed: int, width: int = 60, height: int = 44) -> DepthView:
     K = torch.tensor([[50.0, 0, width / 2], [0, 52, height / 2], [0, 0, 1]])
     pose = se3.exp(0.1 * torch.randn(6, generator=g).double()).float()
     return add_normals(
-        DepthView(Camera(pose, K, width, height), depth, labels, torch.rand(height, width, 3, generator=g)), 0.1
+        DepthView(
+            Camera(pose, K, width, height), depth, labels, (torch.rand(height, width, 3, generator=g) * 255).byte()
+        ),
+        0.1,
     )
 
 
