@@ -64,7 +64,11 @@ def test_a_wrong_motion_is_exchanged_for_a_proposed_one_that_is_refined(scene):
     )
 
 
-def test_a_right_motion_stays(scene):
+def test_a_right_motion_stays(scene, monkeypatch):
+    motions, found, log = scene("prismatic", slide(), [(hinge(), "revolute")])
+    assert found is motions and len(log) == 1
+    assert log[0]["proposed"] > settle.REACH and "energy" not in log[0]  # too far from a gain to be refined
+    monkeypatch.setattr(settle, "REACH", math.inf)
     motions, found, log = scene("prismatic", slide(), [(hinge(), "revolute")])
     assert found is motions and len(log) == 1 and log[0]["energy"] > 0
     motions, found, log = scene("prismatic", slide(), [])
