@@ -65,10 +65,11 @@ def reconsider(
         best = None
         tries = {change: proposed for change, proposed in tries.items() if proposed}
         done = at_once(partial(_best_refined, judge, motions, config.candidates), list(tries.values()))
-        for change, (part, proposed, gained, refined) in zip(tries, done, strict=True):
+        for change, (part, proposed, outcome) in zip(tries, done, strict=True):
             log.append({"change": change, "part": part, "cost": cost, "proposed": -proposed})
-            if refined is None:
+            if outcome is None:
                 continue
+            gained, refined = outcome
             reached = judge.cost(refined)
             log[-1] |= {"type": refined.types[part], "after": reached, "energy": -gained}
             new = part if len(refined) == len(motions) else len(motions)
@@ -86,16 +87,16 @@ def reconsider(
 
 def _best_refined(
     judge: Judge, motions: PartMotions, count: int, proposed: list[tuple[int, PartMotions]]
-) -> tuple[int, float, float, PartMotions | None]:
+) -> tuple[int, float, tuple[float, PartMotions] | None]:
     """Of the ``count`` proposals (part, motions) that surfaces like best the one of least energy: its part, what it
-    gains against ``motions``, what it gains refined, and the motions refined; not refined (the same gain, None) where
-    it is further than ``REACH`` from a gain."""
+    gains against ``motions``, and refined what it gains and its motions; None for these where it is further than
+    ``REACH`` from a gain."""
     proposed = sorted(proposed, key=lambda p: judge.surfaces(p[1]))[:count]
     gain, (part, tried) = max(((judge.gain(p[1], motions), p) for p in proposed), key=itemgetter(0))
     if gain < -REACH:
-        return part, gain, gain, None
+        return part, gain, None
     refined = judge.improved(tried)[2]
-    return part, gain, judge.gain(refined, motions), refined
+    return part, gain, (judge.gain(refined, motions), refined)
 
 
 def _with_part(found: Discovery, states, motions: PartMotions, part: int | None) -> list[PartMotions]:

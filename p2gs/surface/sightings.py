@@ -121,8 +121,6 @@ def no_finer(cameras: Sequence[tuple[int, Camera]], middle: Tensor, voxel: float
     ``middle`` [3]: photographs of 800 pixels and more would take gigabytes."""
     spans = [float(c.K[:2, :2].diagonal().min() * voxel / (c.position - middle).norm()) for _, c in cameras]
     factor = FINEST / max(statistics.median(spans or [0.0]), FINEST)
-    if factor == 1.0:
-        return list(cameras)
     return [(s, c.scaled(max(round(factor * c.width), 1), max(round(factor * c.height), 1))) for s, c in cameras]
 
 
