@@ -107,7 +107,7 @@ def test_the_child_adjusts_a_model(capture, tmp_path):
     model.xyz = model.xyz + 0.01 * np.random.default_rng(1).normal(size=model.xyz.shape)
     write_model(model, tmp_path / "model")
     before = model.errors()[2].mean()
-    job = {"model": str(tmp_path / "model"), "principal_point": False, "iterations": 50}
+    job = {"model": str(tmp_path / "model"), "principal_point": False, "iterations": 50, "known": [], "scale": 1.0}
     result = run_job("adjust", job, tmp_path)
     assert before > 0.5 and result["error"] < 0.05
     assert read_model(tmp_path / "model").errors()[2].mean() < 0.05

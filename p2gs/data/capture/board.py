@@ -113,24 +113,37 @@ def find_board(names: list[str], folder: Path) -> dict[str, dict[int, np.ndarray
     return best if sum(map(len, best.values())) >= MIN_SIGHTINGS else {}
 
 
+CENTRE = 4  # beside a marker's corners 0 to 3
+
+
 def corner_id(marker: int, corner: int) -> int:
-    return 4 * marker + corner
+    """Number of a marker's corner, or of its centre (``CENTRE``)."""
+    return 5 * marker + corner
+
+
+def with_centre(corners: np.ndarray) -> np.ndarray:
+    """[5, 2] pixels of a marker's corners [4, 2] and of its centre, where its diagonals meet."""
+    a, b = corners[2] - corners[0], corners[3] - corners[1]
+    along = np.linalg.solve(np.stack([a, -b], 1), corners[1] - corners[0])[0]
+    return np.vstack([corners, corners[0] + along * a])
 
 
 def with_corners(model: Model, seen: dict[str, dict[int, np.ndarray]], times: int = 1) -> tuple[Model, dict[int, int]]:
-    """The model with a point for each marker corner that two photographs show, and {corner: id of its point}.
+    """The model with a point for each marker's corner and centre that two photographs show, and the ids of these points
+    by number (``corner_id``).
 
     seen: photograph's name -> marker id -> [4, 2] corners.  times: points that each corner becomes; in bundle
     adjustment, which weighs all points alike, it counts as often.
     """
     rays: dict[int, list] = {}
     for key, photo in model.photos.items():
-        for marker, corners in seen.get(photo.name, {}).items():
+        for marker, found in seen.get(photo.name, {}).items():
+            corners = with_centre(found)
             directions = (
                 np.pad(model.lenses[photo.lens].rays(corners), ((0, 0), (0, 1)), constant_values=1.0)
                 @ photo.viewmat[:3, :3]
             )
-            for c in range(4):
+            for c in range(5):
                 rays.setdefault(corner_id(marker, c), []).append((key, photo.position, directions[c], corners[c]))
     next_id, ids, xyz, points, added = int(model.ids.max(initial=0)) + 1, [], [], {}, {}
     for corner, mine in sorted(rays.items()):
@@ -175,15 +188,15 @@ def board_pose(model: Model, points: dict[int, int]) -> tuple[np.ndarray, float]
     """([4, 4] similarity metres -> model, weighted rms in metres) of the board; None where too few markers are whole or
     they do not fit."""
     known, there = template(), set(model.ids.tolist())
-    whole = [m for m in known if all(points.get(corner_id(m, c)) in there for c in range(4))]
+    whole = [m for m in known if all(points.get(corner_id(m, c)) in there for c in range(5))]
     if 4 * len(whole) < MIN_CORNERS:
         return None
-    # centres: a corner creeps inwards where white bleeds into black, a marker's centre does not
+    # centres: a corner creeps where white bleeds into black, a marker's centre does not
     flat = np.array([known[m].mean(0) for m in whole])
-    rows = np.searchsorted(model.ids, [[points[corner_id(m, c)] for c in range(4)] for m in whole])
-    found = model.xyz[rows].mean(1)
+    rows = np.searchsorted(model.ids, [[points[corner_id(m, c)] for c in range(5)] for m in whole])
+    found = model.xyz[rows[:, CENTRE]]
     if len(whole) == 2:  # two centres are a line: all corners, then
-        flat, found = np.concatenate([known[m] for m in whole]), model.xyz[rows].reshape(-1, 3)
+        flat, found = np.concatenate([known[m] for m in whole]), model.xyz[rows[:, :4]].reshape(-1, 3)
     weight = np.ones(len(flat))
     for _ in range(8):  # a marker read wrongly must not stretch the rest
         T = similarity(flat, found, weight)
@@ -193,6 +206,27 @@ def board_pose(model: Model, points: dict[int, int]) -> tuple[np.ndarray, float]
     rms = float(np.sqrt((weight * off**2).sum() / weight.sum()))
     diagonal = float(np.hypot(COLUMNS, ROWS) * (MARKER + GAP))
     return (T, rms) if rms < FITS * diagonal else None
+
+
+def measured(model: Model, points: dict[int, int], times: int = 1) -> tuple[Model, list[int]]:
+    """The model in the board's frame (metres) with its markers' centres where they are printed, and the ids of these
+    points; as it is, and none, where the board does not fit. (Corners are seen a quarter of a millimetre off, by what
+    is black beside them.)
+
+    points, times: of ``with_corners``.
+    """
+    pose = board_pose(model, points)
+    if pose is None:
+        return model, []
+    model = model.moved(np.linalg.inv(pose[0]))
+    xyz, known = model.xyz.copy(), []
+    for marker, corners in template().items():
+        first = points.get(corner_id(marker, CENTRE))
+        ids = [] if first is None else list(range(first, first + times))
+        if ids and np.isin(ids, model.ids).all():
+            xyz[np.searchsorted(model.ids, ids)] = corners.mean(0)
+            known += ids
+    return replace(model, xyz=xyz), known
 
 
 def board_similarity(start: Model, end: Model, seen: dict[str, dict[int, np.ndarray]]) -> np.ndarray | None:

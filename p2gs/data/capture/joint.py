@@ -8,12 +8,13 @@ x 60 pairs of photographs cost minutes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from p2gs.data.capture.certainty import without_unsure
 from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
 from p2gs.data.capture.hypotheses import State, Votes
@@ -26,6 +27,10 @@ NEAR = 0.03  # two reconstructions of one point differ by less than this share o
 ALIKE = 0.8  # cosine of the mean descriptors of one point seen in both states
 MAX_ERROR = 3.0  # pixels: an observation worse than this is a wrong match; good ones are at 0.5 to 0.8
 END_OFFSET = 100_000  # image ids of the end state start here, so that they cannot meet the start's
+RAYLEIGH_MEDIAN = 1.1774  # of the length of a vector of two normal deviates
+CAUCHY_95 = 2.385  # deviations: Rey 1983, DOI 10.1007/978-3-642-69389-2
+LEAST_SCALE = 0.05  # pixels: no corner is known better than to a twentieth
+REFINED = 2  # times that observations are put where the pixels say; with the better poses once more
 ROUNDS = 2  # match, adjust; with the better poses once more
 
 
@@ -127,10 +132,21 @@ def states_of(model: Model) -> np.ndarray:
     return seen
 
 
-def adjusted(model: Model, folder: Path, principal_point: bool, progress: Callable[[str], None]) -> Model:
-    """The model after bundle adjustment in a child process."""
+def adjusted(
+    model: Model, folder: Path, principal_point: bool, progress: Callable[[str], None], known: Sequence[int] = ()
+) -> Model:
+    """The model after bundle adjustment in a child process. known: ids of points that stay where they are.
+
+    An observation counts by Cauchy's loss, at the scale that the model's errors have by their median (a Gaussian's
+    errors are estimated with 95 % of least squares' efficiency): a wrong match is wrong by much more than good ones,
+    whether these are good to a tenth of a pixel or to one.
+    """
     write_model(model, folder / "model")
-    job = {"model": str(folder / "model"), "principal_point": principal_point, "iterations": 60}
+    deviation = float(np.median(model.errors()[2])) / RAYLEIGH_MEDIAN
+    job = {
+        "model": str(folder / "model"), "principal_point": principal_point, "iterations": 60, "known": list(known),
+        "scale": max(CAUCHY_95 * deviation, LEAST_SCALE),
+    }  # fmt: skip
     run_job("adjust", job, folder, progress)
     return read_model(folder / "model")
 
@@ -140,17 +156,22 @@ def join(
     end: State,
     T: np.ndarray,
     folder: Path,
-    extra=None,
+    extra: Callable[[Model], Model] | None = None,
+    measured: Callable[[Model], tuple[Model, list[int]]] | None = None,
+    by_pixels: Callable[[Model], Model] | None = None,
     progress: Callable[[str], None] = lambda text: None,
     by_board: bool = False,
 ) -> Model:
-    """One adjusted model of both states in the start's frame.
+    """One adjusted model of both states, of the photographs that are placed surely.
 
-    T: [4, 4] static similarity start -> end.  extra: function that adds tracks of its own to the merged model (marker
-    corners), or None.  by_board: nothing but the board says T. Then no other point joins the states (a door moves
-    little beside its hinge, and would hold the open state there), and the lenses' middles stay where they are.
+    T: [4, 4] static similarity start -> end.  extra: adds tracks of its own to the merged model (marker corners).
+    measured: gives a model in the frame of what is known of it, and the ids of the points whose places are; these stay
+    there, so that they calibrate the lens (Zhang 2000, DOI 10.1109/34.888718), which a flat front cannot tell from a
+    bent one.  by_pixels: puts observations where the pixels say, given cameras that are nearly right.  by_board:
+    nothing but the board says T. Then no other point joins the states (a door moves little beside its hinge, and would
+    hold the open state there), and lenses' middles stay where they are unless ``measured`` places points.
     """
-    model = None
+    model, known = None, []
     for turn in range(ROUNDS):
         pairs = np.zeros((0, 2), np.int64) if by_board else guided_pairs(start, end, T)
         progress(f"{len(pairs)} points seen in both states")
@@ -158,10 +179,16 @@ def join(
         model = model if extra is None else extra(model)
         model = filtered(model, MAX_ERROR * (4 if turn == 0 else 2))
         model = filtered(adjusted(model, folder, False, progress))
+        model, known = (model, []) if measured is None else measured(model)
         if turn + 1 < ROUNDS:
+            model = filtered(adjusted(model, folder, False, progress, known)) if known else model
             T = _relative(model, start.model, end.model)
     assert model is not None  # there is at least one round
-    return filtered(adjusted(model, folder, not by_board, progress))
+    middle = bool(known) or not by_board
+    for _ in range(REFINED if by_pixels is not None else 0):
+        model = by_pixels(filtered(adjusted(model, folder, middle, progress, known)))
+    model = filtered(adjusted(model, folder, middle, progress, known))
+    return filtered(without_unsure(model))
 
 
 def _relative(model: Model, start: Model, end: Model) -> np.ndarray:

@@ -173,7 +173,8 @@ def drop_blurred(shots: list[Shot]) -> tuple[list[Shot], dict[str, str]]:
 
 
 def lens_groups(shots: list[Shot]) -> list[dict]:
-    """The photographs by lens (device and size), as ``sfm.reconstruct`` wants them."""
+    """The photographs by lens (device and size), as ``sfm.reconstruct`` wants them: square pixels, distortion along the
+    radius, as phones have it. What is across it cannot be told from a shifted middle."""
     groups: dict[tuple, list[Shot]] = {}
     for shot in shots:
         groups.setdefault((shot.device, shot.width, shot.height), []).append(shot)
@@ -183,6 +184,6 @@ def lens_groups(shots: list[Shot]) -> list[dict]:
         params = []
         if known:
             focal = float(np.median(known))
-            params = [focal, focal, width / 2, height / 2, 0, 0, 0, 0]
-        out.append({"names": [s.name for s in mine], "model": "OPENCV", "params": params})
+            params = [focal, width / 2, height / 2, 0, 0]
+        out.append({"names": [s.name for s in mine], "model": "RADIAL", "params": params})
     return out

@@ -15,7 +15,7 @@ from typing import Optional
 import numpy as np
 
 from p2gs.data.capture import board as marker_board
-from p2gs.data.capture import frame, gains, given_masks, page, poses, write
+from p2gs.data.capture import frame, gains, given_masks, keypoint_fit, page, poses, write
 from p2gs.data.capture.auto_masks import auto_masks
 from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
@@ -215,7 +215,16 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
         model, corners = marker_board.with_corners(model, seen, marker_board.WEIGHT)
         return model
 
-    joined = partial(join, *states, chosen.T, work / "joint", with_board, progress)
+    def on_board(model: Model) -> tuple[Model, list[int]]:
+        return marker_board.measured(model, corners, marker_board.WEIGHT)
+
+    def by_pixels(model: Model) -> Model:
+        ids = [first + k for first in corners.values() for k in range(marker_board.WEIGHT)]
+        model, share = keypoint_fit.refined(model, work / "photos", np.array(ids))
+        progress(f"{100 * share:.0f} % of the features placed by their pixels")
+        return model
+
+    joined = partial(join, *states, chosen.T, work / "joint", with_board, on_board, by_pixels, progress)
     depends = [chosen.T.tolist(), [sorted((k, v.tolist()) for k, v in m.items()) for m in seen.values()]]
 
     def make() -> dict:
@@ -302,7 +311,7 @@ def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, bo
     images = []
     for shot in shots:
         file = files.get(shot.name)
-        reason = None if file else "could not be placed among the others"
+        reason = None if file else "could not be placed well among the others"
         images.append({"state": shot.name.split("/")[0], "source": shot.source, "file": file, "reason": reason})
     images += [{"state": n.split("/")[0], "source": s, "file": None, "reason": why} for n, (s, why) in left_out.items()]
     bias, (_, distance) = state_bias(model), model.centre()

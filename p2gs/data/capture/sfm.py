@@ -193,17 +193,27 @@ def _write_descriptors(pycolmap, database: Path, model, path: Path) -> None:
 
 
 def adjust(job: dict) -> dict:
-    """Bundle adjustment of the model in job['model'], written back. principal_point: whether it is refined too."""
+    """Bundle adjustment of the model in job['model'], written back. principal_point: whether it is refined too.  known:
+    ids of points that stay where they are.  scale: of Cauchy's loss, pixels."""
     import pycolmap
 
     model = pycolmap.Reconstruction(job["model"])
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point, options.min_track_length, options.print_summary = job["principal_point"], 2, False
     ceres = options.ceres
-    ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.HUBER, 1.0  # pixels
+    ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, job["scale"]
     ceres.solver_options.num_threads, ceres.solver_options.max_num_iterations = job["threads"], job["iterations"]
     ceres.use_gpu = False
-    pycolmap.bundle_adjustment(model, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        config.add_image(image)
+    for point in job["known"]:
+        if model.exists_point3D(point):
+            config.add_constant_point(point)
+    if not job["known"]:  # else these say where the model lies
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    model.update_point_3d_errors()
     model.write_binary(job["model"])
     return {"error": model.compute_mean_reprojection_error(), "points": model.num_points3D()}
 
