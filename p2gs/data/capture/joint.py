@@ -185,8 +185,9 @@ def join(
             T = _relative(model, start.model, end.model)
     assert model is not None  # there is at least one round
     middle = bool(known) or not by_board
-    for _ in range(REFINED if by_pixels is not None else 0):
-        model = by_pixels(filtered(adjusted(model, folder, middle, progress, known)))
+    for _ in range(REFINED):
+        if by_pixels is not None:
+            model = by_pixels(filtered(adjusted(model, folder, middle, progress, known)))
     model = filtered(adjusted(model, folder, middle, progress, known))
     return filtered(without_unsure(model))
 

@@ -15,12 +15,14 @@ import numpy as np
 
 from p2gs.data.capture.model import Model
 from p2gs.ops.knn import search_tree
+from p2gs.types import UserError
 
 REACH = 7  # px: a patch is a square of 15 of its own photograph's pixels
 FINE = 3  # looks a side into each pixel of the patch in the better photograph, which shows it larger
 PLANE = 12  # points next to one that say how the surface lies there
 ITERATIONS = 8
 FAR = 2.0  # px that a feature may go
+BLOCK = 20_000  # observations at a time, for memory
 ALIKE = 0.9  # least correlation of both patches, as of a marker's picture
 
 
@@ -33,8 +35,7 @@ def refined(model: Model, photos: Path, fixed: np.ndarray) -> tuple[Model, float
     rows, keys, at, slot = _observations(model, fixed)
     if len(rows) < PLANE:
         return model, 0.0
-    grey = {k: cv2.imread(str(photos / p.name), cv2.IMREAD_GRAYSCALE).astype(np.float32)
-            for k, p in model.photos.items()}  # fmt: skip
+    grey = {key: _grey(photos / photo.name) for key, photo in model.photos.items()}
     best = np.full(len(rows), -1.0)
     moved = at.copy()
     for normal in (_normals(model), _towards(model)):
@@ -49,6 +50,14 @@ def refined(model: Model, photos: Path, fixed: np.ndarray) -> tuple[Model, float
         xy[slot[mine]] = moved[mine]
         out[key] = replace(photo, xy=xy)
     return replace(model, photos=out), float(good.mean())
+
+
+def _grey(path: Path) -> np.ndarray:
+    """[H, W] float32. Raises UserError where the file is no picture."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise UserError(f"{path} cannot be read; expected the copy of a photograph, which --out's .capture holds")
+    return image.astype(np.float32)
 
 
 def _observations(model: Model, fixed: np.ndarray):
@@ -109,7 +118,9 @@ def _aligned(model: Model, grey: dict, rows, keys, normals) -> tuple[np.ndarray,
             there = centre[lead[mine], None] + (grid + offset) @ across[mine].transpose(0, 2, 1)
             template[mine] += _sampled(grey[key], there, cv2.INTER_LINEAR)
     template /= len(fine)
-    shift, likeness = _shifts(grey, keys, centre, grid, template)
+    blocks = np.array_split(np.arange(len(rows)), -(-len(rows) // BLOCK))
+    done = [_shifts(grey, keys[b], centre[b], grid, template[b]) for b in blocks]
+    shift, likeness = (np.concatenate(x) for x in zip(*done, strict=True))
     own = lead == np.arange(len(rows))
     shift[own], likeness[own] = 0, 1
     return centre + shift, np.where(solid, likeness, -1)
