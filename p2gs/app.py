@@ -204,6 +204,14 @@ def parser(prog: str = "p2gs") -> Parser:
         "--height", type=float, metavar="M", help="height of the object in metres, where there is no board"
     )
     capture.add_argument(
+        "--box",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="what the object is within, in both states; click it in SCENE/capture.html (default: what cameras look "
+        "at)",
+    )
+    capture.add_argument(
         "--max_views", "--max-views", type=int, default=60, metavar="N", help="photographs a state (default 60)"
     )
     capture.add_argument(

@@ -4,6 +4,7 @@ photograph."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -137,12 +138,17 @@ def distorted(mask: np.ndarray, lens) -> np.ndarray:
 
 
 def auto_masks(
-    model: Model, photos: Path, gains: dict, progress: Callable[[str], None] = lambda text: None
+    model: Model,
+    photos: Path,
+    gains: dict,
+    progress: Callable[[str], None] = lambda text: None,
+    box: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
-    """Masks of both states by photograph's name. model: z up, floor at 0."""
+    """Masks of both states by photograph's name. model: z up, floor at 0.  box: [2, 3] within which the object is in
+    both states (None: what the cameras look at)."""
     centre, distance = model.centre()
-    centre = np.array([*centre[:2], max(centre[2], 0.1 * distance)])
+    centre = np.array([*centre[:2], max(centre[2], 0.1 * distance)]) if box is None else box.mean(0)
     cameras = np.array([p.position for p in model.photos.values()])
-    region = region_of(model.xyz, cameras, centre, distance)
+    region = replace(region_of(model.xyz, cameras, centre, distance), box=box)
     progress(f"masks: a coarse fit of each state ({len(region.planes) - 1} walls)")
     return state_masks(model, photos, gains, region, False) | state_masks(model, photos, gains, region, True)

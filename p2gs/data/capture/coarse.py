@@ -41,16 +41,24 @@ class Picture:
 class Region:
     """Where to look for the object; z up, floor 0.
 
-    centre: [3].  distance: of the cameras.  planes: [n, 4], normal towards the cameras and offset.
+    centre: [3].  distance: of the cameras.  planes: [n, 4], normal towards the cameras and offset.  box: [2, 3] lowest
+    and highest corner of what the user says the object is within; None: a ball about the centre.
     """
 
     centre: np.ndarray
     distance: float
     planes: np.ndarray
+    box: np.ndarray | None = None
 
     def free(self, points: np.ndarray) -> np.ndarray:
         """[N] bool: on the cameras' side of every plane and off it."""
         return (points @ self.planes[:, :3].T - self.planes[:, 3] > OFF_PLANE * self.distance).all(1)
+
+    def holds(self, points: np.ndarray, margin: float = 1.0) -> np.ndarray:
+        """[N] bool: within the box, else within ``margin`` times the ball."""
+        if self.box is not None:
+            return ((points >= self.box[0]) & (points <= self.box[1])).all(1)
+        return np.linalg.norm(points - self.centre, axis=1) < margin * REGION * self.distance
 
 
 def region_of(xyz: np.ndarray, cameras: np.ndarray, centre: np.ndarray, distance: float, seed: int = 0) -> Region:
@@ -81,9 +89,10 @@ def region_of(xyz: np.ndarray, cameras: np.ndarray, centre: np.ndarray, distance
 
 
 def _cloud(region: Region, generator: torch.Generator) -> np.ndarray:
-    points = torch.rand(6 * CLOUD, 3, generator=generator).numpy() * 2 - 1
-    points = points[np.linalg.norm(points, axis=1) < 1] * REGION * region.distance + region.centre
-    return points[region.free(points)][:CLOUD]
+    reach = REGION * region.distance
+    low, high = (region.centre - reach, region.centre + reach) if region.box is None else region.box
+    points = low + torch.rand(6 * CLOUD, 3, generator=generator).numpy() * (high - low)
+    return points[region.holds(points) & region.free(points)][:CLOUD]
 
 
 def _plane_grid(plane: np.ndarray, region: Region) -> np.ndarray:
@@ -173,5 +182,6 @@ def fit(splat: Splat, pictures: list[Picture], distance: float, steps: int = STE
 def object_rows(splat: Splat, region: Region) -> Tensor:
     """[N] bool: the cloud's Gaussians off floor and walls: the object, what stands about, fog before plain walls."""
     means = splat.params["means"].detach().double().numpy()
-    near = np.linalg.norm(means - region.centre, axis=1) < 1.1 * REGION * region.distance
-    return torch.from_numpy((np.arange(len(means)) < splat.cloud) & near & region.free(means))
+    return torch.from_numpy(
+        (np.arange(len(means)) < splat.cloud) & region.holds(means, margin=1.1) & region.free(means)
+    )

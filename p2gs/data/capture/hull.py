@@ -52,7 +52,8 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
     side = np.arange(-reach, reach + step, step)
     grid = (len(side),) * 3
     points = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3) + region.centre
-    free = np.flatnonzero((points @ region.planes[:, :3].T > region.planes[:, 3]).all(1))
+    free = (points @ region.planes[:, :3].T > region.planes[:, 3]).all(1)
+    free = np.flatnonzero(free & (region.box is None or region.holds(points)))
     seen, inside = np.zeros(len(free)), np.zeros(len(free))
     for camera, outline in outlines:
         x, y, _, shown = _projected(points[free], camera)

@@ -12,6 +12,29 @@ import numpy as np
 from p2gs.data.capture.joint import is_end, states_of
 from p2gs.data.capture.model import Model
 
+# Two clicks on a plan are two corners: the box of both plans, as an option of ``p2gs data capture``.
+CLICKS = """
+const box = JSON.parse(document.getElementById('box').dataset.box), at = {};
+function place(plan, x, y) {  // of a pixel of the plan, in the scene
+  const size = Number(plan.dataset.size);
+  return [(x - 300) / 290 * size, (300 - y) / 290 * size];
+}
+function clicked(plan, x, y) {  // whether a box came of it
+  const axes = plan.dataset.axes.split(',').map(Number), name = plan.dataset.axes, here = place(plan, x, y);
+  if (!at[name]) { at[name] = here; return false; }
+  axes.forEach((axis, i) => {
+    box[0][axis] = Math.min(at[name][i], here[i]);
+    box[1][axis] = Math.max(at[name][i], here[i]);
+  });
+  delete at[name];
+  return true;
+}
+function option() { return '--box ' + box.flat().map(v => v.toFixed(4)).join(' '); }
+document.querySelectorAll('svg').forEach(plan => plan.addEventListener('click', event => {
+  const p = new DOMPoint(event.clientX, event.clientY).matrixTransform(plan.getScreenCTM().inverse());
+  if (clicked(plan, p.x, p.y)) document.getElementById('box').textContent = option();
+}));
+"""
 COLOURS = {"seen in the first state only": "#c62", "seen in the second state only": "#26c", "seen in both": "#999"}
 MAX_DOTS = 4000
 
@@ -59,8 +82,8 @@ def _plan(model: Model, box: np.ndarray, axes: tuple[int, int], title: str) -> s
         'stroke-width="2"/>'
     )
     return (
-        '<figure><svg viewBox="0 0 600 600" '
-        f'width="480">{"".join(parts)}</svg><figcaption>{html.escape(title)}</figcaption></figure>'
+        f'<figure><svg viewBox="0 0 600 600" width="480" data-size="{size:.6g}" data-axes="{axes[0]},{axes[1]}">'
+        f"{''.join(parts)}</svg><figcaption>{html.escape(title)}</figcaption></figure>"
     )
 
 
@@ -72,12 +95,18 @@ def write_page(scene: Path, model: Model, box: np.ndarray, facts: dict) -> None:
     left_out = "".join(
         f"<li>{html.escape(i['source'])}: {html.escape(i['reason'])}</li>" for i in facts["images"] if not i["file"]
     )
+    corners = html.escape(json.dumps(box.round(4).tolist()))
+    option = "--box " + " ".join(f"{x:.4f}" for x in box.ravel())
     brief = {k: v for k, v in facts.items() if k not in ("images", "gains")}
     (scene / "capture.html").write_text(
         f"""<!doctype html><meta charset="utf-8"><title>capture</title><style>body{{font:15px sans-serif;margin:2em}}
 figure{{display:inline-block;margin:0 1em}}</style><h1>{html.escape(scene.name)}</h1>
 {_plan(model, box, (0, 1), "from above")}
 {_plan(model, box, (0, 2), "from the side")}<ul>{legend}<li style="color:#090">the object's box</li></ul>
+<p>Masks of the wrong thing? Click two opposite corners of the object in each picture above, wide enough for both
+states, and run the same command with <code id="box" data-box="{corners}">{option}</code> (now: the box that was
+found).</p>
 <h2>Masks</h2><img src="contact.jpg" style="max-width:100%"><h2>Left out</h2><ul>{left_out or "<li>nothing</li>"}</ul>
-<h2>Figures</h2><pre>{html.escape(json.dumps(brief, indent=1))}</pre>"""
+<h2>Figures</h2><pre>{html.escape(json.dumps(brief, indent=1))}</pre>
+<script>{CLICKS}</script>"""
     )

@@ -38,14 +38,15 @@ Progress = Callable[[str], None]
 @dataclass(frozen=True)
 class Options:
     """masks: folder of masks.  ignore: nerfstudio's meaning of them.  poses: COLMAP model or transforms.json.  static:
-    number of the hypothesis to take.  height: metres of the object.  max_views: photographs a state.  size: long edge
-    in pixels."""
+    number of the hypothesis to take.  height: metres of the object.  box: x0 y0 z0 x1 y1 z1 that the object is within,
+    as capture.html has it.  max_views: photographs a state.  size: long edge in pixels."""
 
     masks: Optional[Path] = None
     ignore: bool = False
     poses: Optional[Path] = None
     static: Optional[int] = None
     height: Optional[float] = None
+    box: Optional[tuple[float, ...]] = None
     max_views: int = 60
     size: int = 1600
     careful: bool = False
@@ -100,7 +101,7 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     found = gains.photo_gains(model, work / "photos")
     model, about = _oriented(model, corners)
     if masks is None:
-        masks = auto_masks(model, work / "photos", found, progress)
+        masks = auto_masks(model, work / "photos", found, progress, _given_box(options.box, about, out))
         _keep(masks, out / "masks")
     model = _scaled(model, masks, options, about)
     facts |= about | {"masks": "given" if options.masks else "alpha" if shots[0].alpha else "auto"}
@@ -270,6 +271,25 @@ def _oriented(model: Model, corners: dict[int, int]) -> tuple[Model, dict]:
     return model.moved(frame.to_world(floor, model, metres)), about | {"scale": {"source": source}, "up": floor.source}
 
 
+def _given_box(box: Optional[tuple[float, ...]], about: dict, out: Path) -> Optional[np.ndarray]:
+    """[2, 3] corners of ``Options.box`` in the model's units before it is scaled. Raises UserError for a box without
+    room in it, and where no earlier run says how long a unit is."""
+    if box is None:
+        return None
+    corners, factor, before = np.array(box, float).reshape(2, 3), 1.0, out / "capture.json"
+    if not (corners[0] < corners[1]).all():
+        given = " ".join(f"{x:g}" for x in box)
+        raise UserError(f"--box {given}: expected x0 y0 z0 x1 y1 z1, each first below its second")
+    if about["scale"]["source"] != "board":
+        if not before.is_file():
+            raise UserError(
+                f"--box: without a marker board its units are those of {out / 'capture.html'}, which is not there yet; "
+                "run without --box first"
+            )
+        factor = float(json.loads(before.read_text())["scale"].get("factor", 1.0))
+    return corners / factor
+
+
 def _scaled(model: Model, masks: dict[str, np.ndarray], options: Options, about: dict) -> Model:
     """The model with the object's height, or else its diagonal of 1, where no board gave metres; notes it in
     ``about``."""
@@ -279,7 +299,7 @@ def _scaled(model: Model, masks: dict[str, np.ndarray], options: Options, about:
         factor = 1 / float(np.linalg.norm(box[1] - box[0]))
         if options.height is not None:
             factor, scale["source"] = options.height / float(box[1, 2]), "height"
-        model = model.moved(np.diag([factor, factor, factor, 1.0]))
+        model, scale["factor"] = model.moved(np.diag([factor, factor, factor, 1.0])), factor
     scale["metric"] = scale["source"] != "object diagonal"
     return model
 
