@@ -24,11 +24,7 @@ OPEN = 0.7  # share of the recorded motion
 
 def opened(folder: Path) -> dict[str, float]:
     """Joint positions, OPEN of the way from start to end."""
-    limits = {
-        j.get("name"): j.find("limit")
-        for j in ET.parse(folder / "twin.urdf").findall("joint")
-        if j.get("type") != "fixed"
-    }
+    limits = {j.get("name"): j.find("limit") for j in ET.parse(folder / "twin.urdf").findall("joint") if j.get("type") != "fixed"}
     return {name: OPEN * max((float(x.get("lower")), float(x.get("upper"))), key=abs) for name, x in limits.items()}
 
 
@@ -37,12 +33,7 @@ def mujoco(folder: Path) -> np.ndarray:
 
     spec = mujoco.MjSpec.from_file(str(folder / "twin.xml"))
     spec.worldbody.add_light(pos=EYE * 2, dir=TARGET - EYE, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    sky = {
-        "type": mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        "width": 8,
-        "height": 8,
-    }
+    sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT, "width": 8, "height": 8}
     spec.add_texture(name="sky", rgb1=[0.9] * 3, rgb2=[0.9] * 3, **sky)
     model = spec.compile()
     model.vis.global_.fovy = np.degrees(FIELD)
@@ -53,10 +44,7 @@ def mujoco(folder: Path) -> np.ndarray:
     back = TARGET - EYE
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance = TARGET, np.linalg.norm(back)
-    camera.azimuth, camera.elevation = (
-        np.degrees(np.arctan2(back[1], back[0])),
-        np.degrees(np.arcsin(back[2] / camera.distance)),
-    )
+    camera.azimuth, camera.elevation = np.degrees(np.arctan2(back[1], back[0])), np.degrees(np.arcsin(back[2] / camera.distance))
     with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
         renderer.update_scene(data, camera)
         return renderer.render()
@@ -71,9 +59,7 @@ def pybullet(folder: Path) -> np.ndarray:
         p.resetJointState(twin, j, opened(folder)[p.getJointInfo(twin, j)[1].decode()])
     view = p.computeViewMatrix(EYE.tolist(), TARGET.tolist(), [0, 0, 1])
     lens = p.computeProjectionMatrixFOV(np.degrees(FIELD), WIDTH / HEIGHT, 0.1, 20)
-    image = p.getCameraImage(
-        WIDTH, HEIGHT, view, lens, lightDirection=(EYE * [0.5, 1, 2]).tolist(), renderer=p.ER_TINY_RENDERER
-    )[2]
+    image = p.getCameraImage(WIDTH, HEIGHT, view, lens, lightDirection=(EYE * [0.5, 1, 2]).tolist(), renderer=p.ER_TINY_RENDERER)[2]
     return np.reshape(image, (HEIGHT, WIDTH, 4))[..., :3].astype(np.uint8)
 
 

@@ -54,9 +54,9 @@ def test_the_truth_is_a_joint_that_takes_the_front_from_start_to_end():
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(("kind", "apart"), [("textured", 1.0), ("plain", 3.0), ("board", 10.0)])
+@pytest.mark.parametrize(("kind", "apart"), [("textured", 1.0), ("plain", 3.0), ("board", 3.0)])
 def test_what_is_accepted_is_right(tmp_path, kind, apart):
-    """A plain room is refused or right; the board alone links two states to some millimetres (docs/data.md)."""
+    """A plain room is refused or right; the board alone links two states to a millimetre or two (docs/data.md)."""
     pytest.importorskip("pycolmap")
     row = rooms.run(tmp_path, kind, 1, 24)
     assert kind != "textured" or "refused" not in row
