@@ -66,6 +66,7 @@ def test_poses_and_masks_become_a_scene(capture, tmp_path, capsys):
     assert command(capture, out, "--masks", str(capture / "masks"), "--height", "0.7") == 0
     assert not [f for f in check_dataset(out) if f.level == "error"]
     facts = json.loads((out / "capture.json").read_text())
+    assert facts["scale"].pop("factor") > 0
     assert facts["scale"] == {"source": "height", "metric": True}
     assert facts["masks"] == "given" and facts["up"] == "floor plane"
     assert len(facts["images"]) == 18 and all(i["file"] and (out / i["file"]).is_file() for i in facts["images"])

@@ -106,15 +106,18 @@ def board_model(times: int) -> tuple[Model, dict[int, int]]:
 @pytest.mark.parametrize("times", [1, 3])
 def test_the_boards_centres_lie_where_they_are_printed(times):
     model, points = board_model(times)
-    placed, known = measured(model, points, times)
-    assert len(known) == 12 * times
+    placed, known, rms = measured(model, points, times)
+    assert len(known) == 12 * times and 1e-5 < rms < 2e-4
     for marker, corners in template().items():
         rows = [points[corner_id(marker, CENTRE)] - 1 + k for k in range(times)]
         assert np.abs(placed.xyz[rows] - corners.mean(0)).max() < 1e-12
         corner = placed.xyz[points[corner_id(marker, 0)] - 1]  # no longer 3 metres a metre, and not moved otherwise
         assert 0 < np.abs(corner - corners[0]).max() < 2e-4
     few = {k: v for k, v in points.items() if k < 5}
-    assert measured(model, few, times) == (model, [])
+    assert measured(model, few, times) == (model, [], None)
+    bent = replace(model, xyz=model.xyz + 0.02 * np.sin(20 * model.xyz[:, :1]))
+    same, none, rms = measured(bent, points, times)
+    assert same is bent and none == [] and rms > 0.001
 
 
 def test_a_markers_centre_is_where_its_diagonals_meet():

@@ -19,6 +19,7 @@ COLUMNS, ROWS, MARKER, GAP = 4, 3, 0.040, 0.010  # metres
 DPI = 300
 MIN_CORNERS = 8  # two markers: one alone fixes the scale to a per cent at best
 FITS = 0.05  # rms of the corners over the board's diagonal: more and the sheet was not flat, or is another board
+FLAT = 0.001  # metres, rms: a sheet that is bent by more is not what was printed, and would bend the lens
 # px: smaller photographs are enlarged before markers are sought, which are a dozen pixels wide from across a room
 SMALL = 2400
 WEIGHT = 10  # features that a corner counts as: it is known to a sixth of a pixel, they to half of one
@@ -208,16 +209,16 @@ def board_pose(model: Model, points: dict[int, int]) -> tuple[np.ndarray, float]
     return (T, rms) if rms < FITS * diagonal else None
 
 
-def measured(model: Model, points: dict[int, int], times: int = 1) -> tuple[Model, list[int]]:
-    """The model in the board's frame (metres) with its markers' centres where they are printed, and the ids of these
-    points; as it is, and none, where the board does not fit. (Corners are seen a quarter of a millimetre off, by what
-    is black beside them.)
+def measured(model: Model, points: dict[int, int], times: int = 1) -> tuple[Model, list[int], float | None]:
+    """The model in the board's frame (metres) with its markers' centres where they are printed, the ids of these points
+    and how far they were off before (metres, root mean square); as it is, and no ids, where the board does not fit or
+    does not lie flat. (Corners are seen a quarter of a millimetre off, by what is black beside them.)
 
     points, times: of ``with_corners``.
     """
     pose = board_pose(model, points)
-    if pose is None:
-        return model, []
+    if pose is None or pose[1] > FLAT:
+        return model, [], None if pose is None else pose[1]
     model = model.moved(np.linalg.inv(pose[0]))
     xyz, known = model.xyz.copy(), []
     for marker, corners in template().items():
@@ -226,7 +227,7 @@ def measured(model: Model, points: dict[int, int], times: int = 1) -> tuple[Mode
         if ids and np.isin(ids, model.ids).all():
             xyz[np.searchsorted(model.ids, ids)] = corners.mean(0)
             known += ids
-    return replace(model, xyz=xyz), known
+    return replace(model, xyz=xyz), known, pose[1]
 
 
 def board_similarity(start: Model, end: Model, seen: dict[str, dict[int, np.ndarray]]) -> np.ndarray | None:

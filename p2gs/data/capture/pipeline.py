@@ -104,7 +104,7 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
         masks = auto_masks(model, work / "photos", found, progress, _given_box(options.box, about, out))
         _keep(masks, out / "masks")
     model = _scaled(model, masks, options, about)
-    facts |= about | {"masks": "given" if options.masks else "alpha" if shots[0].alpha else "auto"}
+    facts = about | facts | {"masks": "given" if options.masks else "alpha" if shots[0].alpha else "auto"}
     progress("writing")
     files = write.write_scene(model, work / "photos", masks, found, out)
     box = _object_box(model, masks)
@@ -210,6 +210,7 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
     facts["static"] = static
     progress(f"static scene: hypothesis {static} with {len(chosen.pairs)} votes, spread {chosen.spread:.2f}")
     corners: dict[int, int] = {}
+    board_rms: float | None = None
 
     def with_board(model: Model) -> Model:
         nonlocal corners
@@ -217,7 +218,9 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
         return model
 
     def on_board(model: Model) -> tuple[Model, list[int]]:
-        return marker_board.measured(model, corners, marker_board.WEIGHT)
+        nonlocal board_rms
+        model, known, board_rms = marker_board.measured(model, corners, marker_board.WEIGHT)
+        return model, known
 
     def by_pixels(model: Model) -> Model:
         ids = [first + k for first in corners.values() for k in range(marker_board.WEIGHT)]
@@ -226,7 +229,9 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
         return model
 
     joined = partial(join, *states, chosen.T, work / "joint", with_board, on_board, by_pixels, progress)
-    depends = [chosen.T.tolist(), [sorted((k, v.tolist()) for k, v in m.items()) for m in seen.values()]]
+    # the name is what this stage is: what an earlier build kept had other numbers for the board's points
+    sightings = [sorted((k, v.tolist()) for k, v in m.items()) for m in seen.values()]
+    depends = ["placed by pixels", chosen.T.tolist(), sightings]
 
     def make() -> dict:
         model = joined(by_board=bool(chosen.board) and not chosen.wide)
@@ -235,9 +240,12 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
         if chosen.board:
             check_board_link(board_link(model), Path(shots[0].source).parent)
         write_model(model, work / "joined")
-        return {"corners": corners}
+        return {"corners": corners, "board_rms": board_rms}
 
-    corners = {int(k): v for k, v in cache.get("joint", depends, make, progress)["corners"].items()}
+    result = cache.get("joint", depends, make, progress)
+    corners = {int(k): v for k, v in result["corners"].items()}
+    if result.get("board_rms") is not None:  # before the board was held
+        facts["board_rms_mm"] = round(1000 * result["board_rms"], 2)
     return read_model(work / "joined"), corners, facts
 
 
