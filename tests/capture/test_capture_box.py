@@ -13,7 +13,7 @@ from p2gs.data.capture.coarse import Region, _cloud, object_rows
 from p2gs.data.capture.hull import hull_of
 from p2gs.data.capture.model import Lens, Model, Photo
 from p2gs.data.capture.page import CLICKS, _plan, write_page
-from p2gs.data.capture.pipeline import _given_box
+from p2gs.data.capture.world import given_box
 from p2gs.data.generated.synthetic import look_at
 from p2gs.types import Camera, UserError
 
@@ -63,14 +63,14 @@ def test_the_page_says_the_box_that_was_found(tmp_path, monkeypatch):
 def test_the_box_is_in_units_of_the_page(tmp_path):
     numbers = tuple(BOX.ravel())
     board, object_ = {"scale": {"source": "board"}}, {"scale": {"source": "object diagonal"}}
-    assert _given_box(None, object_, tmp_path) is None
-    assert np.allclose(_given_box(numbers, board, tmp_path), BOX)
+    assert given_box(None, object_, tmp_path) is None
+    assert np.allclose(given_box(numbers, board, tmp_path), BOX)
     with pytest.raises(UserError, match="run without --box first"):
-        _given_box(numbers, object_, tmp_path)
+        given_box(numbers, object_, tmp_path)
     (tmp_path / "capture.json").write_text(json.dumps({"scale": {"factor": 2.0}}))
-    assert np.allclose(_given_box(numbers, object_, tmp_path), BOX / 2)
+    assert np.allclose(given_box(numbers, object_, tmp_path), BOX / 2)
     with pytest.raises(UserError, match="each first below its second"):
-        _given_box(numbers[::-1], board, tmp_path)
+        given_box(numbers[::-1], board, tmp_path)
 
 
 def test_what_lies_outside_the_box_is_not_the_object():

@@ -15,7 +15,7 @@ from typing import Optional
 import numpy as np
 
 from p2gs.data.capture import board as marker_board
-from p2gs.data.capture import frame, gains, given_masks, keypoint_fit, page, poses, write
+from p2gs.data.capture import frame, gains, given_masks, keypoint_fit, page, poses, world, write
 from p2gs.data.capture.auto_masks import auto_masks
 from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
@@ -99,15 +99,15 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
         _check_arc(model, state)
     progress("exposure and white balance")
     found = gains.photo_gains(model, work / "photos")
-    model, about = _oriented(model, corners)
+    model, about = world.oriented(model, corners)
     if masks is None:
-        masks = auto_masks(model, work / "photos", found, progress, _given_box(options.box, about, out))
+        masks = auto_masks(model, work / "photos", found, progress, world.given_box(options.box, about, out))
         _keep(masks, out / "masks")
-    model = _scaled(model, masks, options, about)
+    model = world.scaled(model, masks, options.height, about)
     facts = about | facts | {"masks": "given" if options.masks else "alpha" if shots[0].alpha else "auto"}
     progress("writing")
     files = write.write_scene(model, work / "photos", masks, found, out)
-    box = _object_box(model, masks)
+    box = world.box_of(model, masks)
     left_out |= {s.name: (s.source, "its mask is empty") for s in shots if s.name not in masks}
     shots = [s for s in shots if s.name in masks]
     facts |= _facts(model, shots, left_out, files, found, box)
@@ -261,77 +261,6 @@ def _check_arc(model: Model, state: str) -> None:
         raise UserError(f"state '{state}': the photographs go only {arc:.0f} degrees around the object, expected at "
                         f"least {MIN_ARC:.0f}; "
                         "walk from one side of the front to the other, at two or three heights")  # fmt: skip
-
-
-def _oriented(model: Model, corners: dict[int, int]) -> tuple[Model, dict]:
-    """The model with z up, the floor at 0 and, where there is a board, in metres; what was used for it."""
-    floor, pose = frame.floor_of(model), marker_board.board_pose(model, corners)
-    metres, source, about = 1.0, "object diagonal", {}
-    if pose is not None:
-        T, rms = pose
-        metres, source = 1 / float(np.cbrt(np.linalg.det(T[:3, :3]))), "board"
-        normal = T[:3, 2] * metres
-        normal = normal * np.sign(normal @ frame.mean_up(model))
-        # two measures of one floor: the larger plane is better
-        if normal @ floor.normal < np.cos(np.radians(5)) or floor.source == "cameras":
-            floor = frame.Floor(normal, float(normal @ T[:3, 3]), "board")
-        about["board_rms_mm"] = round(1000 * rms, 2)
-    return model.moved(frame.to_world(floor, model, metres)), about | {"scale": {"source": source}, "up": floor.source}
-
-
-def _given_box(box: Optional[tuple[float, ...]], about: dict, out: Path) -> Optional[np.ndarray]:
-    """[2, 3] corners of ``Options.box`` in the model's units before it is scaled. Raises UserError for a box without
-    room in it, and where no earlier run says how long a unit is."""
-    if box is None:
-        return None
-    corners, factor, before = np.array(box, float).reshape(2, 3), 1.0, out / "capture.json"
-    if not (corners[0] < corners[1]).all():
-        given = " ".join(f"{x:g}" for x in box)
-        raise UserError(f"--box {given}: expected x0 y0 z0 x1 y1 z1, each first below its second")
-    if about["scale"]["source"] != "board":
-        if not before.is_file():
-            raise UserError(
-                f"--box: without a marker board its units are those of {out / 'capture.html'}, which is not there yet; "
-                "run without --box first"
-            )
-        factor = float(json.loads(before.read_text())["scale"].get("factor", 1.0))
-    return corners / factor
-
-
-def _scaled(model: Model, masks: dict[str, np.ndarray], options: Options, about: dict) -> Model:
-    """The model with the object's height, or else its diagonal of 1, where no board gave metres; notes it in
-    ``about``."""
-    scale = about["scale"]
-    if scale["source"] != "board":
-        box = _object_box(model, masks)
-        factor = 1 / float(np.linalg.norm(box[1] - box[0]))
-        if options.height is not None:
-            factor, scale["source"] = options.height / float(box[1, 2]), "height"
-        model, scale["factor"] = model.moved(np.diag([factor, factor, factor, 1.0])), factor
-    scale["metric"] = scale["source"] != "object diagonal"
-    return model
-
-
-def _object_box(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
-    """[2, 3] corners of the object by its masks, in the model's coordinates (floor at z = 0)."""
-    import cv2
-    import torch
-
-    from p2gs.data.box import object_box
-    from p2gs.types import Camera, View
-
-    views = []
-    for photo in (p for p in model.photos.values() if p.name in masks):
-        lens = model.lenses[photo.lens]
-        pinhole = write.pinhole_of(lens)
-        alpha = cv2.remap(masks[photo.name], *pinhole.maps, cv2.INTER_NEAREST)
-        camera = Camera(torch.tensor(photo.viewmat).float(), torch.tensor(pinhole.K).float(), lens.width, lens.height)
-        views.append(
-            View(photo.name, int(is_end(photo.name)), "train", camera, torch.empty(0), torch.from_numpy(alpha))
-        )
-    box = object_box(views).double().numpy()
-    box[0, 2] = max(box[0, 2], 0.0)  # the hull of photographs from above goes on below the floor
-    return box
 
 
 def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, box: np.ndarray) -> dict:

@@ -1,0 +1,87 @@
+"""The joint model brought into the scene's world: up, the floor at 0, metres where something says how long they are,
+and the object's box."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Optional
+
+import numpy as np
+
+from p2gs.data.capture import board as marker_board
+from p2gs.data.capture import frame, write
+from p2gs.data.capture.joint import is_end
+from p2gs.data.capture.model import Model
+from p2gs.types import UserError
+
+
+def oriented(model: Model, corners: dict[int, int]) -> tuple[Model, dict]:
+    """The model with z up, the floor at 0 and, where there is a board, in metres; what was used for it."""
+    floor, pose = frame.floor_of(model), marker_board.board_pose(model, corners)
+    metres, source, about = 1.0, "object diagonal", {}
+    if pose is not None:
+        T, rms = pose
+        metres, source = 1 / float(np.cbrt(np.linalg.det(T[:3, :3]))), "board"
+        normal = T[:3, 2] * metres
+        normal = normal * np.sign(normal @ frame.mean_up(model))
+        # two measures of one floor: the larger plane is better
+        if normal @ floor.normal < np.cos(np.radians(5)) or floor.source == "cameras":
+            floor = frame.Floor(normal, float(normal @ T[:3, 3]), "board")
+        about["board_rms_mm"] = round(1000 * rms, 2)
+    return model.moved(frame.to_world(floor, model, metres)), about | {"scale": {"source": source}, "up": floor.source}
+
+
+def given_box(box: Optional[tuple[float, ...]], about: dict, out: Path) -> Optional[np.ndarray]:
+    """[2, 3] corners of the option ``--box`` in the model's units before it is scaled. Raises UserError for a box
+    without room in it, and where no earlier run says how long a unit is."""
+    if box is None:
+        return None
+    corners, factor, before = np.array(box, float).reshape(2, 3), 1.0, out / "capture.json"
+    if not (corners[0] < corners[1]).all():
+        given = " ".join(f"{x:g}" for x in box)
+        raise UserError(f"--box {given}: expected x0 y0 z0 x1 y1 z1, each first below its second")
+    if about["scale"]["source"] != "board":
+        if not before.is_file():
+            raise UserError(
+                f"--box: without a marker board its units are those of {out / 'capture.html'}, which is not there yet; "
+                "run without --box first"
+            )
+        factor = float(json.loads(before.read_text())["scale"].get("factor", 1.0))
+    return corners / factor
+
+
+def scaled(model: Model, masks: dict[str, np.ndarray], height: Optional[float], about: dict) -> Model:
+    """The model with the object's height, or else its diagonal of 1, where no board gave metres; notes it in
+    ``about``."""
+    scale = about["scale"]
+    if scale["source"] != "board":
+        box = box_of(model, masks)
+        factor = 1 / float(np.linalg.norm(box[1] - box[0]))
+        if height is not None:
+            factor, scale["source"] = height / float(box[1, 2]), "height"
+        model, scale["factor"] = model.moved(np.diag([factor, factor, factor, 1.0])), factor
+    scale["metric"] = scale["source"] != "object diagonal"
+    return model
+
+
+def box_of(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
+    """[2, 3] corners of the object by its masks, in the model's coordinates (floor at z = 0)."""
+    import cv2
+    import torch
+
+    from p2gs.data.box import object_box
+    from p2gs.types import Camera, View
+
+    views = []
+    for photo in (p for p in model.photos.values() if p.name in masks):
+        lens = model.lenses[photo.lens]
+        pinhole = write.pinhole_of(lens)
+        alpha = cv2.remap(masks[photo.name], pinhole.maps[0], pinhole.maps[1], cv2.INTER_NEAREST)
+        camera = Camera(torch.tensor(photo.viewmat).float(), torch.tensor(pinhole.K).float(), lens.width, lens.height)
+        views.append(
+            View(photo.name, int(is_end(photo.name)), "train", camera, torch.empty(0), torch.from_numpy(alpha))
+        )
+    box = object_box(views).double().numpy()
+    box[0, 2] = max(box[0, 2], 0.0)  # the hull of photographs from above goes on below the floor
+    return box
