@@ -12,7 +12,9 @@ from p2gs.data.capture.certainty import UNSURE, spreads, without_unsure
 from p2gs.data.capture.joint import adjusted
 from p2gs.data.capture.keypoint_fit import refined
 from p2gs.data.capture.model import Lens, Model, Photo
+from p2gs.data.capture.pipeline import _check_arc
 from p2gs.data.generated.synthetic import look_at
+from p2gs.types import UserError
 
 FOCAL, WIDTH, HEIGHT = 600.0, 640, 480
 LENS = Lens("RADIAL", WIDTH, HEIGHT, np.array([FOCAL, 324.0, 238.0, -0.05, 0.01]))
@@ -175,3 +177,11 @@ def test_photographs_that_show_too_little_are_left_out():
     assert sorted(without_unsure(model).photos) == [0, 1, 4, 5]
     spread, distance = spreads(model), model.centre()[1]
     assert spread[3] == np.inf and spread[2] > UNSURE * distance > spread[0]
+
+
+def test_a_state_with_few_sure_photographs_is_refused():
+    model = plane_model(count=6)
+    with pytest.raises(UserError, match="only 6 photographs are placed surely"):
+        _check_arc(model, "start")
+    with pytest.raises(UserError, match="state 'end': only 0 photographs"):
+        _check_arc(model, "end")

@@ -250,9 +250,15 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
 
 
 def _check_arc(model: Model, state: str) -> None:
-    centre, _ = model.centre()
+    """Raises UserError where a state's photographs are too few, or from one side alone."""
     mine = [p for p in model.photos.values() if is_end(p.name) == (state == "end")]
-    up = frame.mean_up(model)
+    few = UserError(
+        f"state '{state}': only {len(mine)} photographs are placed surely, expected at least {MIN_REGISTERED}; "
+        "take more, closer together, with the room in view"
+    )
+    if not mine:
+        raise few
+    (centre, _), up = model.centre(), frame.mean_up(model)
     away = np.array([p.position for p in mine]) - centre
     x = np.linalg.svd(up[None])[2][1]
     angles = np.sort(np.degrees(np.arctan2(away @ np.cross(up, x), away @ x)))
@@ -261,6 +267,8 @@ def _check_arc(model: Model, state: str) -> None:
         raise UserError(f"state '{state}': the photographs go only {arc:.0f} degrees around the object, expected at "
                         f"least {MIN_ARC:.0f}; "
                         "walk from one side of the front to the other, at two or three heights")  # fmt: skip
+    if len(mine) < MIN_REGISTERED:
+        raise few
 
 
 def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, box: np.ndarray) -> dict:
