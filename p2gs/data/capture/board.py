@@ -23,6 +23,7 @@ FLAT = 0.001  # metres, rms: a sheet that is bent by more is not what was printe
 # px: smaller photographs are enlarged before markers are sought, which are a dozen pixels wide from across a room
 SMALL = 2400
 WEIGHT = 10  # features that a corner counts as: it is known to a sixth of a pixel, they to half of one
+POINTS, CENTRE = 5, 4  # of a marker: corners 0 to 3 and its centre
 MIN_SIGHTINGS = 4  # markers over all photographs: textures that look like one do so once
 
 
@@ -114,12 +115,9 @@ def find_board(names: list[str], folder: Path) -> dict[str, dict[int, np.ndarray
     return best if sum(map(len, best.values())) >= MIN_SIGHTINGS else {}
 
 
-CENTRE = 4  # beside a marker's corners 0 to 3
-
-
 def corner_id(marker: int, corner: int) -> int:
     """Number of a marker's corner, or of its centre (``CENTRE``)."""
-    return 5 * marker + corner
+    return POINTS * marker + corner
 
 
 def with_centre(corners: np.ndarray) -> np.ndarray:
@@ -144,7 +142,7 @@ def with_corners(model: Model, seen: dict[str, dict[int, np.ndarray]], times: in
                 np.pad(model.lenses[photo.lens].rays(corners), ((0, 0), (0, 1)), constant_values=1.0)
                 @ photo.viewmat[:3, :3]
             )
-            for c in range(5):
+            for c in range(POINTS):
                 rays.setdefault(corner_id(marker, c), []).append((key, photo.position, directions[c], corners[c]))
     next_id, ids, xyz, points, added = int(model.ids.max(initial=0)) + 1, [], [], {}, {}
     for corner, mine in sorted(rays.items()):
@@ -185,16 +183,22 @@ def _meet(rays: list) -> np.ndarray | None:
     return point
 
 
+def ids_of(points: dict[int, int], times: int, corner: int | None = None) -> list[int]:
+    """Ids of all points of the board, or of one number's (``corner_id``). points, times: of ``with_corners``."""
+    first = points.values() if corner is None else [points[corner]] if corner in points else []
+    return [i + k for i in first for k in range(times)]
+
+
 def board_pose(model: Model, points: dict[int, int]) -> tuple[np.ndarray, float] | None:
     """([4, 4] similarity metres -> model, weighted rms in metres) of the board; None where too few markers are whole or
     they do not fit."""
     known, there = template(), set(model.ids.tolist())
-    whole = [m for m in known if all(points.get(corner_id(m, c)) in there for c in range(5))]
+    whole = [m for m in known if all(points.get(corner_id(m, c)) in there for c in range(POINTS))]
     if 4 * len(whole) < MIN_CORNERS:
         return None
     # centres: a corner creeps where white bleeds into black, a marker's centre does not
     flat = np.array([known[m].mean(0) for m in whole])
-    rows = np.searchsorted(model.ids, [[points[corner_id(m, c)] for c in range(5)] for m in whole])
+    rows = np.searchsorted(model.ids, [[points[corner_id(m, c)] for c in range(POINTS)] for m in whole])
     found = model.xyz[rows[:, CENTRE]]
     if len(whole) == 2:  # two centres are a line: all corners, then
         flat, found = np.concatenate([known[m] for m in whole]), model.xyz[rows[:, :4]].reshape(-1, 3)
@@ -222,8 +226,7 @@ def measured(model: Model, points: dict[int, int], times: int = 1) -> tuple[Mode
     model = model.moved(np.linalg.inv(pose[0]))
     xyz, known = model.xyz.copy(), []
     for marker, corners in template().items():
-        first = points.get(corner_id(marker, CENTRE))
-        ids = [] if first is None else list(range(first, first + times))
+        ids = ids_of(points, times, corner_id(marker, CENTRE))
         if ids and np.isin(ids, model.ids).all():
             xyz[np.searchsorted(model.ids, ids)] = corners.mean(0)
             known += ids

@@ -30,7 +30,8 @@ def spreads(model: Model) -> dict[int, float]:
         lens, small = model.lenses[photo.lens], 1e-6 * float(np.linalg.norm(local, axis=1).mean())
         steps = [np.cross(axis, local) * 1e-6 for axis in np.eye(3)] + [axis * small for axis in np.eye(3)]
         size = [1e-6] * 3 + [small] * 3
-        J = np.stack([(lens.project(local + d) - lens.project(local)) / s for d, s in zip(steps, size, strict=True)], 2)
+        here = lens.project(local)
+        J = np.stack([(lens.project(local + d) - here) / s for d, s in zip(steps, size, strict=True)], 2)
         A = J.reshape(-1, 6).T @ J.reshape(-1, 6)
         variance = float((error[mine][first] ** 2).mean()) / 2
         fixed = np.linalg.cond(A) < 1e16

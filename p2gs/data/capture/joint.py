@@ -156,9 +156,9 @@ def join(
     end: State,
     T: np.ndarray,
     folder: Path,
-    extra: Callable[[Model], Model] | None = None,
-    measured: Callable[[Model], tuple[Model, list[int]]] | None = None,
-    by_pixels: Callable[[Model], Model] | None = None,
+    extra: Callable[[Model], Model],
+    measured: Callable[[Model], tuple[Model, list[int]]],
+    by_pixels: Callable[[Model], Model],
     progress: Callable[[str], None] = lambda text: None,
     by_board: bool = False,
 ) -> Model:
@@ -175,19 +175,17 @@ def join(
     for turn in range(ROUNDS):
         pairs = np.zeros((0, 2), np.int64) if by_board else guided_pairs(start, end, T)
         progress(f"{len(pairs)} points seen in both states")
-        model = merged(start.model, end.model, T, pairs)
-        model = model if extra is None else extra(model)
+        model = extra(merged(start.model, end.model, T, pairs))
         model = filtered(model, MAX_ERROR * (4 if turn == 0 else 2))
         model = filtered(adjusted(model, folder, False, progress))
-        model, known = (model, []) if measured is None else measured(model)
+        model, known = measured(model)
         if turn + 1 < ROUNDS:
             model = filtered(adjusted(model, folder, False, progress, known)) if known else model
             T = _relative(model, start.model, end.model)
     assert model is not None  # there is at least one round
     middle = bool(known) or not by_board
     for _ in range(REFINED):
-        if by_pixels is not None:
-            model = by_pixels(filtered(adjusted(model, folder, middle, progress, known)))
+        model = by_pixels(filtered(adjusted(model, folder, middle, progress, known)))
     model = filtered(adjusted(model, folder, middle, progress, known))
     return filtered(without_unsure(model))
 

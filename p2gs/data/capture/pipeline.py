@@ -223,8 +223,8 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
         return model, known
 
     def by_pixels(model: Model) -> Model:
-        ids = [first + k for first in corners.values() for k in range(marker_board.WEIGHT)]
-        model, share = keypoint_fit.refined(model, work / "photos", np.array(ids))
+        board = np.array(marker_board.ids_of(corners, marker_board.WEIGHT), np.int64)
+        model, share = keypoint_fit.refined(model, work / "photos", board)
         progress(f"{100 * share:.0f} % of the features placed by their pixels")
         return model
 
