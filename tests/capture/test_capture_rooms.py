@@ -13,6 +13,8 @@ import capture_room
 import rooms
 
 from p2gs.data.capture.board import COLUMNS, GAP, MARKER, ROWS, find_markers, template
+from p2gs.data.capture.child import run_job
+from p2gs.data.capture.sfm import default_effort
 
 
 def corners_on_the_floor(room):
@@ -61,3 +63,19 @@ def test_what_is_accepted_is_right(tmp_path, kind, apart):
     row = rooms.run(tmp_path, kind, 1, 24)
     assert kind != "textured" or "refused" not in row
     assert "refused" in row or row["apart_mm"] < apart
+
+
+@pytest.mark.slow
+def test_the_same_photographs_give_the_same_model(tmp_path):
+    """Twice the same to the last bit, on two threads."""
+    pytest.importorskip("pycolmap")
+    capture_room.write_room(tmp_path, "textured", seed=0, photos=8)
+    names = sorted(p.name for p in (tmp_path / "start").iterdir())
+    group = {"names": names, "model": "RADIAL", "params": None, "known_focal": False}
+    job = {"images": str(tmp_path / "start"), "groups": [group], "effort": default_effort(False), "threads": 2}
+    written = []
+    for k in ("a", "b"):
+        found = run_job("reconstruct", {**job, "out": str(tmp_path / k)}, tmp_path / f"{k}_job")
+        assert found["registered"] >= 6
+        written.append({p.name: p.read_bytes() for p in sorted((tmp_path / k / "model").iterdir())})
+    assert written[0] == written[1]

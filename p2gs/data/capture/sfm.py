@@ -17,6 +17,8 @@ import numpy as np
 
 VOTERS = 400  # features of largest scale that vote on which photographs may show the same thing
 MIN_VOTES = 4  # mutual best among them; by chance two photographs of different places have 0 to 2
+# thread of adjustments: several add up in another order each time, and half a millimetre of a plain room hung on that
+ONE = 1
 PARTNERS = 20  # photographs that each is matched with; a hand-held walk has about 6 neighbours at each of three heights
 
 
@@ -56,12 +58,13 @@ def reconstruct(job: dict) -> dict:
     out.mkdir(parents=True, exist_ok=True)
     database = out / "database.db"
     database.unlink(missing_ok=True)
+    pycolmap.Database.open(str(database)).close()
     pycolmap.set_random_seed(job["seed"])
     total = sum(len(g["names"]) for g in job["groups"])
     say(f"features of {total} photographs")
     for group in job["groups"]:
         _features(pycolmap, database, job, group, effort)
-    _match(pycolmap, database, job["threads"], effort)
+    _match(pycolmap, database, job, effort)
     best, models = _map(pycolmap, database, job, effort, total)
     if best is None:
         return {"registered": 0, "models": 0, "points": 0}
@@ -84,23 +87,28 @@ def _features(pycolmap, database: Path, job: dict, group: dict, effort: Effort) 
     reader.camera_model = group["model"]
     if group["params"]:
         reader.camera_params = ",".join(repr(float(p)) for p in group["params"])
+    photographs = {"image_names": group["names"], "camera_mode": pycolmap.CameraMode.SINGLE}
+    # else they are numbered as features are done, on several threads in another order each time
+    pycolmap.import_images(database, job["images"], options=reader, **photographs)
     pycolmap.extract_features(
         database,
         job["images"],
-        image_names=group["names"],
-        camera_mode=pycolmap.CameraMode.SINGLE,
+        **photographs,
         reader_options=reader,
         extraction_options=options,
         device=pycolmap.Device.cpu,
     )
 
 
-def _match(pycolmap, database: Path, threads: int, effort: Effort) -> None:
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads, options.use_gpu = threads, False
+def _match(pycolmap, database: Path, job: dict, effort: Effort) -> None:
+    options, checks = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    options.num_threads, options.use_gpu = job["threads"], False
+    checks.ransac.random_seed = job["seed"]  # else each thread draws on from the pair that it had before
     if not effort.preselect:
         say("matching every pair")
-        pycolmap.match_exhaustive(database, matching_options=options, device=pycolmap.Device.cpu)
+        pycolmap.match_exhaustive(
+            database, matching_options=options, verification_options=checks, device=pycolmap.Device.cpu
+        )
         return
     pairs = _likely_pairs(pycolmap, database)
     say(f"matching {len(pairs)} pairs")
@@ -108,7 +116,13 @@ def _match(pycolmap, database: Path, threads: int, effort: Effort) -> None:
     listing.write_text("".join(f"{a} {b}\n" for a, b in pairs))
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = listing
-    pycolmap.match_image_pairs(database, matching_options=options, pairing_options=pairing, device=pycolmap.Device.cpu)
+    pycolmap.match_image_pairs(
+        database,
+        matching_options=options,
+        pairing_options=pairing,
+        verification_options=checks,
+        device=pycolmap.Device.cpu,
+    )
 
 
 def _likely_pairs(pycolmap, database: Path) -> list[tuple[str, str]]:
@@ -154,7 +168,7 @@ def _unit(descriptors: np.ndarray) -> np.ndarray:
 def _map(pycolmap, database: Path, job: dict, effort: Effort, total: int):
     """(largest model or None, number of models)."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed, options.extract_colors = job["threads"], job["seed"], True
+    options.num_threads, options.random_seed, options.extract_colors = ONE, job["seed"], True
     options.min_model_size, options.max_num_models, options.ba_use_gpu = 3, 8, False
     options.mapper.init_min_num_inliers, options.mapper.init_min_tri_angle = effort.init_inliers, effort.init_angle
     options.mapper.abs_pose_min_num_inliers = effort.pose_inliers
@@ -202,7 +216,7 @@ def adjust(job: dict) -> dict:
     options.refine_principal_point, options.min_track_length, options.print_summary = job["principal_point"], 2, False
     ceres = options.ceres
     ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, job["scale"]
-    ceres.solver_options.num_threads, ceres.solver_options.max_num_iterations = job["threads"], job["iterations"]
+    ceres.solver_options.num_threads, ceres.solver_options.max_num_iterations = ONE, job["iterations"]
     ceres.use_gpu = False
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
