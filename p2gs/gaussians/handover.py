@@ -50,13 +50,8 @@ class Registration:
     figures: dict = field(default_factory=dict)
 
     @property
-    def moved(self) -> bool:
-        """Whether the states were apart."""
-        return not torch.equal(self.transform, torch.eye(4).to(self.transform))
-
-    @property
     def is_identity(self) -> bool:
-        return not bool(self.log_gain.any()) and not self.moved
+        return not bool(self.log_gain.any()) and torch.equal(self.transform, torch.eye(4).to(self.transform))
 
 
 @dataclass

@@ -41,16 +41,14 @@ class RegistrationConfig:
 
     motion, gain: "auto" (held-out photographs decide) or "never".  reach: distance up to which unmoved surfaces are
     looked for; states brought together by hand are off by about a hundredth. An object that moved farther as one is a
-    part that has no base.  steps: of refinement by photographs, a
-    side and size.  sizes: of those photographs, pixels.  surfels: at most so many a state.  least: share by which
-    held-out errors must fall.  least_shift: a motion that moves surfaces by less is not applied: a tenth of a pixel of
-    the finest photographs.
+    part that has no base.  levels: sizes of the photographs that refine it, pixels.  surfels: at most so many a state.
+    least: share by which held-out errors must fall.  least_shift: a motion that moves surfaces by less is not applied:
+    a tenth of a pixel of the finest photographs.
     """
 
     motion: Literal["auto", "never"] = "auto"
     gain: Literal["auto", "never"] = "auto"
     reach: float = 0.03
-    steps: int = 100
     levels: list[int] = field(default_factory=lambda: [200, 400])
     surfels: int = 12000
     least: float = 0.02
@@ -91,7 +89,7 @@ def align_states(
     gain = pair.end_gain(T, fitted[0], config.levels[0]) if config.gain == "auto" else dark
     moved = NOTHING
     for size in config.levels if config.motion == "auto" else ():
-        T = fit_photographs(pair.sides(gain), T, fitted, config.steps, size, tolerance, backend=backend)
+        T = fit_photographs(pair.sides(gain), T, [p[::2] for p in fitted], size, backend=backend)
         moved = pair.tried(judged, size, still, T, gain)
         if not moved.passed(config.least):
             break  # states that lie on one another need no finer look
@@ -100,9 +98,11 @@ def align_states(
     why_not = ""
     if moved.passed(config.least) and shift > config.reach:
         why_not = f", as that is more than {100 * config.reach:.0f} %: what moved that far is taken for a part"
-    elif moved.passed(config.least) and pair.tried(judged, config.levels[-1], T, still, gain).better >= 0:
+    elif moved.passed(config.least):
         # a lid that was lifted lies on itself if the pot fell, too: then the pot's own photographs are worse
-        why_not = ", as what stands still without it would be worse"
+        without = pair.tried(judged, config.levels[-1], T, still, gain)
+        if without.passed(config.least):
+            why_not = f", as what stands still without it would be worse ({without.told()})"
     apply_motion = moved.passed(config.least) and shift > config.least_shift and not why_not
     best = T if apply_motion else still
     shots = pair.judges(judged, config.levels[-1], best)

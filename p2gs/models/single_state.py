@@ -232,6 +232,8 @@ class SingleStatePhase(StatePhase):
                 self.decide(0, "gains", try_gains(g, views, errors, config, self.rasterizer))
             if bool(errors.on[0]):
                 errors.log_gains += measure_gains(g, views, errors, config.levels[0], self.rasterizer)
+        if bool(errors.on[1]) and step in [round(share * self.total_steps) for share in config.bundled]:
+            errors.adjust(g, views, self.level(step), self.rasterizer)
         known = errors.log_gains.cpu()
         if bool(known.any()) and (self.without_gains is None or not torch.equal(known, self.without_gains)):
             self.views[self.state] = TrainingViews(errors.views(self.shots), views.levels)

@@ -86,6 +86,13 @@ def log(T: Tensor) -> Tensor:
     return torch.cat([w, (V_inv @ T[..., :3, 3:])[..., 0]], -1)
 
 
+def adjoint(T: Tensor) -> Tensor:
+    """[..., 6, 6] with T exp(xi) = exp(adjoint(T) xi) T, twists rotation first. Lynch and Park, definition 3.20."""
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    top = torch.cat([R, torch.zeros_like(R)], -1)
+    return torch.cat([top, torch.cat([so3.skew(t) @ R, R], -1)], -2)
+
+
 def _is_matrix(x: Tensor) -> bool:
     return x.dim() >= 2 and x.shape[-2:] == (4, 4)
 

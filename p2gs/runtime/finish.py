@@ -8,8 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 from p2gs.context import RunContext
-from p2gs.gaussians.handover import Articulation, CanonicalGaussians, PartMotions, Registration, StateGaussians
-from p2gs.models.base_at_rest import put_base_to_rest
+from p2gs.gaussians.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
 from p2gs.models.finish import FinishConfig, finish
 from p2gs.models.stage import Stage, register_phase
 from p2gs.parts.slots import slot_report
@@ -21,7 +20,7 @@ class FinishStage(Stage):
 
     Config = FinishConfig
     needs = ("states", "canonical", "learned")
-    uses = ("sharpened", "motions", "registration")
+    uses = ("sharpened", "motions")
     gives = "twin"
 
     @classmethod
@@ -39,7 +38,6 @@ class FinishStage(Stage):
         learned: Articulation,
         sharpened: list[StateGaussians] | None = None,
         motions: PartMotions | None = None,
-        registration: Registration | None = None,
     ) -> dict:
         from p2gs.diagnosis.measures import StageResults
         from p2gs.diagnosis.page import write_diagnosis
@@ -48,8 +46,6 @@ class FinishStage(Stage):
         config, found_in, states = section.config, states, sharpened or states
         if run.exact:
             config = replace(config, part_penalty=0.0)  # as many slots as were asked for
-        if registration is not None and registration.moved:
-            learned, states = put_base_to_rest(run, config, learned, found_in, states, registration)
         backend = {"backend": run.backend, "twin_backend": run.rasterizer, "device": run.device}
         losses = run.losses("articulation")
         obj, notes, record = finish(

@@ -127,7 +127,7 @@ def aligned(states, scene, say=None) -> Registration:
     views = {s: TrainingViews(scene.select(state=s), [96], crop=False) for s in (0, 1)}
     evidence = [gather_evidence(s.gaussians, scene.select(state=s.state), 96, 0.1) for s in states]
     box = torch.tensor([[-0.6, -0.3, -0.6], [0.8, 1.0, 0.6]])
-    return align_states(states, evidence, views, box, RegistrationConfig(levels=[96], steps=60), report=say)
+    return align_states(states, evidence, views, box, RegistrationConfig(levels=[96]), report=say)
 
 
 def test_misaligned_and_darker():

@@ -37,6 +37,12 @@ def test_exp_is_the_matrix_exponential_and_log_inverts_it():
     assert (se3.exp(xi.view(5, 20, 6)) == se3.exp(xi).view(5, 20, 4, 4)).all()
 
 
+def test_adjoint_takes_a_twist_to_the_other_side():
+    T, xi = se3.exp(twists()), twists().flip(0)
+    moved = se3.exp((se3.adjoint(T) @ xi[..., None])[..., 0]) @ T
+    torch.testing.assert_close(T @ se3.exp(xi), moved, atol=1e-10, rtol=0)
+
+
 def test_inverse_and_apply():
     T = se3.exp(twists())
     torch.testing.assert_close(se3.inverse(T) @ T, torch.eye(4, dtype=F64).expand_as(T), atol=1e-12, rtol=0)
