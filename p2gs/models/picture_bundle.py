@@ -8,16 +8,15 @@ doi:10.1109/TPAMI.2017.2658577.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Sequence
+from typing import Iterable
 
 import torch
 from torch import Tensor
 
-from p2gs.data.views import TrainingViews
-from p2gs.motion.photo_fit import GREY, photograph
+from p2gs.data.views import TargetImage
+from p2gs.motion.photo_fit import GREY
 from p2gs.motion.picture_steps import SHIFT, TWIST, PictureSteps, picture_steps
-from p2gs.types import Camera, GaussianTensors
+from p2gs.types import GaussianTensors
 
 # standard deviations of what is sought, internal units (the object is 2)
 TWIST_SIGMA = 0.003  # of cameras: twice what structure from motion leaves
@@ -26,16 +25,11 @@ CELL = 0.06  # internal units: surface within a cube of this side, eight pixels 
 
 
 @torch.no_grad()
-def adjust_pictures(
-    g: GaussianTensors, views: TrainingViews, cameras: Sequence[Camera], size: int, backend: str
-) -> Tensor:
-    """[V, 6] float64, mean zero: twists by which cameras go from V to V exp(twist).  cameras: of the pictures at
-    ``size``, as known by now."""
-    said, grey = [], torch.full((3,), GREY).to(g.means)
-    for index, camera in enumerate(cameras):
-        shot = replace(photograph(views, index, size, g.means.device), camera=camera)
-        said.append(_by_cells(picture_steps(g, shot, grey, backend)))
-    return _solved(said)
+def adjust_pictures(g: GaussianTensors, shots: Iterable[TargetImage], backend: str) -> Tensor:
+    """[V, 6] float64, mean zero: twists by which cameras go from V to V exp(twist).  shots: one state's photographs on
+    grey, with their cameras as known by now; taken one at a time."""
+    grey = torch.full((3,), GREY).to(g.means)
+    return _solved([_by_cells(picture_steps(g, shot, grey, backend)) for shot in shots])
 
 
 def _by_cells(steps: PictureSteps) -> tuple[Tensor, Tensor, Tensor]:

@@ -95,14 +95,7 @@ def align_states(
             break  # states that lie on one another need no finer look
     points = surfels[1].points.double()
     shift = float((se3.apply(T, points) - points).norm(dim=1).square().mean().sqrt()) / diagonal
-    why_not = ""
-    if moved.passed(config.least) and shift > config.reach:
-        why_not = f", as that is more than {100 * config.reach:.0f} %: what moved that far is taken for a part"
-    elif moved.passed(config.least):
-        # a lid that was lifted lies on itself if the pot fell, too: then the pot's own photographs are worse
-        without = pair.tried(judged, config.levels[-1], T, still, gain)
-        if without.passed(config.least):
-            why_not = f", as what stands still without it would be worse ({without.told()})"
+    why_not = pair.objection(judged, config, T, gain, shift) if moved.passed(config.least) else ""
     apply_motion = moved.passed(config.least) and shift > config.least_shift and not why_not
     best = T if apply_motion else still
     shots = pair.judges(judged, config.levels[-1], best)
@@ -171,6 +164,18 @@ class Pair:
         """One motion in place of another, by the held-out pixels where nothing moved by the new one."""
         shots = self.judges(picks, size, with_it)
         return trial(*(self.errors(shots, T, gain, STRUCTURE) for T in (without, with_it)))
+
+    def objection(
+        self, picks: list[list[int]], config: RegistrationConfig, transform: Tensor, gain: Tensor, shift: float
+    ) -> str:
+        """Why a motion that held-out photographs are better with is none of frames, for the user; nothing if it is.
+        shift: share of the diagonal by which it moves surfaces."""
+        if shift > config.reach:
+            return f", as that is more than {100 * config.reach:.0f} %: what moved that far is taken for a part"
+        # a lid that was lifted lies on itself if the pot fell, too: then the pot's own photographs are worse
+        without = self.tried(picks, config.levels[-1], transform, torch.eye(4, dtype=torch.float64), gain)
+        told = f", as what stands still without it would be worse ({without.told()})"
+        return told if without.passed(config.least) else ""
 
     def judges(self, picks: list[list[int]], size: int, transform: Tensor) -> list[tuple[int, TargetImage, Tensor]]:
         """Held-out photographs of the end and of the start: the side, the picture, and where nothing moved by

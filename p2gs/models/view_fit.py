@@ -113,10 +113,10 @@ class ViewErrors(nn.Module):
         return replace(camera, viewmat=moved.to(camera.viewmat)) if bool(self.on[1]) else camera
 
     def adjust(self, g: GaussianTensors, views: TrainingViews, size: int, backend: str) -> None:
-        """All cameras at once, by bundle adjustment of the pictures."""
-        shots = [photograph(views, i, size, g.means.device) for i in range(len(views))]
-        cameras = [self.found(i, shot.camera) for i, shot in enumerate(shots)]
-        twists = adjust_pictures(g, views, cameras, size, backend)
+        """All cameras at once, by bundle adjustment of the pictures of ``size`` pixels."""
+        photos = (photograph(views, i, size, g.means.device) for i in range(len(views)))
+        shots = (replace(shot, camera=self.found(i, shot.camera)) for i, shot in enumerate(photos))
+        twists = adjust_pictures(g, shots, backend)
         self.twists.copy_(se3.log(se3.exp(self.twists.cpu()) @ se3.exp(twists)))
         self.twists -= self.twists.mean(0)
 

@@ -83,13 +83,13 @@ def test_all_cameras_at_once():
     twists = 0.006 * torch.randn(len(views), 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     twists -= twists.mean(0)
     shots = correct_views(views, ViewCorrections(se3.exp(twists), torch.zeros(len(views), 3)))
-    seen, found = TrainingViews(shots, [SIZE], crop=False), torch.zeros(len(views), 6).double()
+    photos, found = [shot_of(shots, k) for k in range(len(shots))], torch.zeros(len(views), 6).double()
     for _ in range(3):
-        cameras = [
-            replace(v.camera, viewmat=(v.camera.viewmat.double() @ se3.exp(x)).float())
-            for v, x in zip(shots, found, strict=True)
+        known = [
+            replace(p, camera=replace(p.camera, viewmat=(p.camera.viewmat.double() @ se3.exp(x)).float()))
+            for p, x in zip(photos, found, strict=True)
         ]
-        step = adjust_pictures(g, seen, cameras, SIZE, "auto")
+        step = adjust_pictures(g, known, "auto")
         assert step.mean(0).abs().max() < 1e-12
         found = se3.log(se3.exp(found) @ se3.exp(step))
     left = se3.log(se3.exp(twists) @ se3.exp(found))
