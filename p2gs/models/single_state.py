@@ -226,7 +226,7 @@ class SingleStatePhase(StatePhase):
         g, views = self.splats.tensors().detach(), self.views[self.state]
         due = [round(share * self.total_steps) for share in (config.at, *config.measured)]
         if step == due[0] and config.cameras == "auto":
-            self.decide(1, "cameras", try_cameras(g, views, config, self.rasterizer))
+            self.decide(1, "cameras", try_cameras(g, views, config.levels[0], self.rasterizer))
         if step in due[1:] and config.gains == "auto":
             if not bool(errors.decided[0]):
                 self.decide(0, "gains", try_gains(g, views, errors, config, self.rasterizer))

@@ -55,14 +55,17 @@ class PictureSteps:
 
 
 @torch.no_grad()
-def picture_steps(g: GaussianTensors, shot: TargetImage, background: Tensor, backend: str) -> PictureSteps:
-    """The pixels of ``shot``, which lies on ``background`` [3], that show a surface and have a slope; float64 on the
-    CPU."""
+def picture_steps(
+    g: GaussianTensors, shot: TargetImage, background: Tensor, backend: str, part: Tensor | None = None
+) -> PictureSteps:
+    """The pixels of ``shot``, which lies on ``background`` [3], that show a surface and have a slope, of these those of
+    ``part`` [H, W] (0 or 1) where it is given; float64 on the CPU."""
     out = render_gaussians(g, shot.camera, background, backend=backend)
     drawn, photo, alpha = out.colour.cpu(), shot.image.cpu(), out.alpha.cpu()
     # a picture whose content moves by d changes by -slope d; the mean of both slopes converges twice as fast
     slope = -_gradient((drawn + photo) / 2)
-    shown = steepest(slope.square().sum((2, 3)) * (alpha > SHOWN))
+    squares = slope.square().sum((2, 3)) * (alpha > SHOWN)
+    shown = steepest(squares if part is None else squares * part.cpu())
     slope, off = slope[shown].double(), (photo - drawn)[shown].double()
     points, moves = _moves(shot.camera, shown, (out.depth.cpu() / alpha)[shown].double())
     weighted = slope * _weights(off, slope)[..., None]

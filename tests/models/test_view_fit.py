@@ -21,7 +21,7 @@ from p2gs.ops.ssim import l1_ssim
 from p2gs.types import TwoStateScene
 
 SIZE = 64
-CONFIG = ViewFitConfig(levels=[SIZE], judges=8)
+CONFIG = ViewFitConfig(levels=[SIZE])
 
 
 def scene(count: int = 8):
@@ -61,8 +61,8 @@ def test_gains_are_measured():
 
 def test_only_real_errors_of_cameras_are_seen():
     g, views = scene()
-    assert try_cameras(g, pyramid(moved(views, 0.006)), CONFIG, "auto").passed(CONFIG.least)
-    assert not try_cameras(g, pyramid(views), CONFIG, "auto").passed(CONFIG.least)
+    assert try_cameras(g, pyramid(moved(views, 0.006)), SIZE, "auto").passed(CONFIG.least)
+    assert not try_cameras(g, pyramid(views), SIZE, "auto").passed(CONFIG.least)
 
 
 def test_cameras_are_learned():
@@ -126,7 +126,7 @@ def test_a_phase_decides():
     g, views = scene()
     shots, gains = exposed(views, 0.06)
     for photos, wrong in ((shots, True), (views, False)):
-        forgive = ViewFitConfig("auto", "never", levels=[SIZE], judges=8)
+        forgive = ViewFitConfig("auto", "never", levels=[SIZE])
         config = SingleStateConfig(steps=10, levels=[SIZE], level_starts=[0.0], initial_gaussians=50, forgive=forgive)
         box = torch.tensor([[-0.6, -0.2, -0.6], [0.6, 0.9, 0.6]])
         phase = SingleStatePhase(config, {}, TwoStateScene("panels", tuple(photos), box=box), 0, pyramid(photos))
