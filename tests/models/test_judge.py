@@ -6,13 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 from test_finish import two_states
-from tiny import slide
+from tiny import hinge, photographs, slide, textured_panels
 
-from p2gs.gaussians.handover import PartMotions
+from p2gs.data.views import TrainingViews
+from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.difference import weighted_loss
 from p2gs.motion.joint_confidence import state_depth
 from p2gs.motion.refine_motions import Judge, explanation_cost, what_counts
 from p2gs.motion.screw_polish import PolishConfig
+from p2gs.ops import se3
+from p2gs.ops.carry import Parts, carry
 from p2gs.ops.ssim import l1_ssim_reference, ssim_map
 
 CONFIG = PolishConfig(levels=[64], level_starts=[0.0], steps=0)
@@ -97,3 +100,27 @@ def test_answers_are_the_same_bits_for_any_number_of_threads():
         answers.append((judge.gain(true, false), judge.own_share(true, false), refined.transforms.tolist()))
         assert torch.get_num_threads() == count
     assert answers[0] == answers[1]
+
+
+def test_a_part_that_was_explained_better_before_goes_back_alone():
+    """Of two bodies one got better and one worse: each keeps the motion that explains it."""
+    size, still = 96, torch.eye(4, dtype=torch.float64)
+    # everything has a say: of these panels of thick blobs much reaches over its edge
+    polish = PolishConfig(steps=100, levels=[size], level_starts=[0.0], min_margin=0.0, free_static=0.0)
+    g, moving = textured_panels(1200)
+    means, quats, sh = carry(g.means, g.quats, g.sh, Parts(moving), torch.stack([hinge()]))
+    states = [StateGaussians(0, g), StateGaussians(1, replace(g, means=means, quats=quats, sh=sh))]
+    views = {
+        s: TrainingViews(photographs(x.gaussians, moving, still, 0, size, 8), [size], crop=False)
+        for s, x in enumerate(states)
+    }
+    labels = torch.where((moving == 0) & (g.means[:, 0] < g.means[:, 0].mean()), 2, moving)
+    margins = [torch.ones(len(labels))] * 2
+    wrong = se3.exp(torch.tensor([0, 0, 0.05, 0.02, 0, 0], dtype=torch.float64))
+
+    def bodies(first, second):
+        return PartMotions(["free"] * 2, torch.stack([first, second]), torch.ones(2), [labels] * 2, margins)
+
+    judge = Judge(None, states, views, polish, [state_depth(s, views[s.state], size) for s in states], 0, "auto")
+    kept = judge.no_worse(bodies(wrong @ hinge(), still), bodies(hinge(), wrong)).transforms
+    assert torch.equal(kept[0], hinge()) and torch.equal(kept[1], still)
