@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TargetImage
-from p2gs.motion.photo_fit import GREY
 from p2gs.motion.picture_steps import SHIFT, TWIST, PictureSteps, picture_steps
 from p2gs.types import GaussianTensors
 
@@ -26,10 +25,9 @@ CELL = 0.06  # internal units: surface within a cube of this side, eight pixels 
 
 @torch.no_grad()
 def adjust_pictures(g: GaussianTensors, shots: Iterable[TargetImage], backend: str) -> Tensor:
-    """[V, 6] float64, mean zero: twists by which cameras go from V to V exp(twist).  shots: one state's photographs on
-    grey, with their cameras as known by now; taken one at a time."""
-    grey = torch.full((3,), GREY).to(g.means)
-    return _solved([_by_cells(picture_steps(g, shot, grey, backend)) for shot in shots])
+    """[V, 6] float64, mean zero: twists by which cameras go from V to V exp(twist).  shots: one state's photographs
+    before grey, with their cameras as known by now; taken one at a time."""
+    return _solved([_by_cells(picture_steps(g, shot, backend)) for shot in shots])
 
 
 def _by_cells(steps: PictureSteps) -> tuple[Tensor, Tensor, Tensor]:

@@ -23,7 +23,8 @@ from p2gs.gaussians.handover import Registration, StateGaussians
 from p2gs.models.registered import REGISTRATION, dimmed, register_state, register_views, write_registration
 from p2gs.models.stage import Stage, register_phase
 from p2gs.models.trial import Trial, held_out, trial
-from p2gs.motion.photo_fit import COLOUR, STRUCTURE, PhotoSide, compare, fit_photographs, photograph, unmoved
+from p2gs.motion.on_grey import photograph
+from p2gs.motion.photo_fit import COLOUR, STRUCTURE, PhotoSide, compare, fit_photographs, unmoved
 from p2gs.motion.surface_fit import fit_surfaces
 from p2gs.ops import se3, so3
 from p2gs.types import GaussianTensors

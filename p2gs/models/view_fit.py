@@ -17,12 +17,12 @@ from torch import Tensor, nn
 
 from p2gs.data.exposure import brightened, median_gain
 from p2gs.data.views import TargetImage, TrainingViews
-from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import ViewCorrections
 from p2gs.models.picture_bundle import TWIST_SIGMA, adjust_pictures
 from p2gs.models.registered import correct_views
 from p2gs.models.trial import Trial, trial
-from p2gs.motion.photo_fit import GREY, STRUCTURE, photograph
+from p2gs.motion.on_grey import drawing, photograph
+from p2gs.motion.photo_fit import STRUCTURE
 from p2gs.motion.picture_steps import TWIST, picture_steps
 from p2gs.ops import se3
 from p2gs.ops.ssim import l1_ssim
@@ -54,6 +54,11 @@ class ViewFitConfig:
     rate: float = 1e-3
     least: float = 0.02
     least_cameras: float = 0.08
+
+
+def turned(camera: Camera, twist: Tensor) -> Camera:
+    """The camera V exp(twist [6]); differentiable by the twist."""
+    return replace(camera, viewmat=(camera.viewmat.double().cpu() @ se3.exp(twist.cpu())).to(camera.viewmat))
 
 
 class RowAdam:
@@ -104,12 +109,11 @@ class ViewErrors(nn.Module):
             return camera
         twist = self.twists[index].clone().requires_grad_()
         self._looked_at = index, twist
-        return replace(camera, viewmat=(camera.viewmat.double().cpu() @ se3.exp(twist.cpu())).to(camera.viewmat))
+        return turned(camera, twist)
 
     def found(self, index: int, camera: Camera) -> Camera:
         """The photograph's camera as it is known by now, without gradient."""
-        moved = camera.viewmat.double().cpu() @ se3.exp(self.twists[index].cpu())
-        return replace(camera, viewmat=moved.to(camera.viewmat)) if bool(self.on[1]) else camera
+        return turned(camera, self.twists[index]) if bool(self.on[1]) else camera
 
     def adjust(self, g: GaussianTensors, views: TrainingViews, size: int, backend: str) -> None:
         """All cameras at once, by bundle adjustment of the pictures of ``size`` pixels."""
@@ -147,7 +151,7 @@ def measure_gains(g: GaussianTensors, views: TrainingViews, errors: ViewErrors, 
     for index in range(len(views)):
         shot = photograph(views, index, size, g.means.device)
         camera = errors.found(index, shot.camera)
-        out = render_gaussians(g, camera, torch.full((3,), GREY).to(g.means), backend=backend)
+        out = drawing(g, camera, backend)
         gain = median_gain(shot.image, out.colour, (shot.alpha > 0.99) & (out.alpha > 0.99))
         found[index] = 0 if gain is None else gain.double().cpu()
     return found - found.mean(0)
@@ -170,7 +174,7 @@ def try_gains(
     for index in range(len(views)):
         shot = photograph(views, index, config.levels[0], g.means.device)
         camera = errors.found(index, shot.camera)
-        out = render_gaussians(g, camera, torch.full((3,), GREY).to(g.means), backend=backend)
+        out = drawing(g, camera, backend)
         inside = (shot.alpha > 0.99) & (out.alpha > 0.99)
         both = [half.to(g.means) for half in halves(*inside.shape)]
         gains = [median_gain(shot.image, out.colour, inside & (half > 0)) for half in both]
@@ -203,16 +207,14 @@ def try_cameras(g: GaussianTensors, views: TrainingViews, size: int, backend: st
 
 def fit_camera(g: GaussianTensors, shot: TargetImage, half: Tensor, backend: str) -> Camera:
     """The camera with which a photograph explains ``half`` [H, W] of it best; the Gaussians stay."""
-    grey = torch.full((3,), GREY).to(g.means)
     for _ in range(LOOKS):
-        normal, right = picture_steps(g, shot, grey, backend, half).total()
+        normal, right = picture_steps(g, shot, backend, half).total()
         known = normal[TWIST, TWIST] + torch.eye(6).double() / TWIST_SIGMA**2
-        viewmat = shot.camera.viewmat.double().cpu() @ se3.exp(torch.linalg.solve(known, right[TWIST]))
-        shot = replace(shot, camera=replace(shot.camera, viewmat=viewmat.to(shot.camera.viewmat)))
+        shot = replace(shot, camera=turned(shot.camera, torch.linalg.solve(known, right[TWIST])))
     return shot.camera
 
 
 def half_error(g: GaussianTensors, shot: TargetImage, half: Tensor, backend: str) -> Tensor:
     """Image loss, a scalar, over the pixels of ``half`` [H, W]."""
-    out = render_gaussians(g, shot.camera, torch.full((3,), GREY).to(g.means), backend=backend)
+    out = drawing(g, shot.camera, backend)
     return l1_ssim(shot.image + half[..., None] * (out.colour - shot.image), shot.image, STRUCTURE)

@@ -14,6 +14,7 @@ from p2gs.motion.discovery.hypotheses import shared_directions
 from p2gs.motion.discovery.rigid import one_way, perpendicular
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
+from p2gs.ops.robust import MEDIAN_SIGMA
 
 WITHIN = 15.0  # degrees within which a direction is one that is known, or an axis is meant to lie along it
 KNOWN = 1.0  # degrees to which directions are known, or an axis is another's
@@ -125,7 +126,7 @@ def _tilt(across: Tensor, offset: Tensor, rounds: int = 5) -> tuple[Tensor, Tens
     for _ in range(rounds):
         A, b = (x * weight[:, None]).T @ x, (x * weight[:, None]).T @ y
         residual = y - x @ torch.linalg.lstsq(A, b[:, None]).solution[:, 0]
-        spread = 1.4826 * float(residual.abs().median()) + 1e-9
+        spread = MEDIAN_SIGMA * float(residual.abs().median()) + 1e-9
         weight = 1 / (1 + (residual / (2 * spread)).square()).square()
         A, b = A / spread**2, b / spread**2
     return A, b

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from p2gs.data.views import TargetImage, TrainingViews
 from p2gs.gaussians.draw import render_gaussians
+from p2gs.motion.on_grey import drawing, photograph
 from p2gs.motion.picture_steps import TWIST, picture_steps
 from p2gs.ops import se3
 from p2gs.ops.ssim import l1_ssim
 from p2gs.types import Camera, GaussianTensors, RenderOutput
 
-GREY = 0.5  # what stands behind the object in every picture
 STRUCTURE, COLOUR = 0.8, 0.0  # weight of SSIM where a motion is judged, which no exposure changes, and where a gain is
 ROUNDS = 10  # of Gauss and Newton; each leaves a third to a half of what is left
 SETTLED = 2e-5  # internal units: a two-hundredth of a pixel of 400
@@ -42,10 +42,7 @@ class PhotoSide:
 
     def draw(self, camera: Camera, transform: Tensor, backend: str) -> RenderOutput:
         """The Gaussians as the photograph's camera sees them, before grey; differentiable by ``transform``."""
-        seen = _at(camera, self.viewmat(camera, transform).to(camera.viewmat))
-        return render_gaussians(
-            self.gaussians, seen, torch.full((3,), GREY, device=camera.viewmat.device), backend=backend
-        )
+        return drawing(self.gaussians, _at(camera, self.viewmat(camera, transform).to(camera.viewmat)), backend)
 
 
 def unmoved(side: PhotoSide, camera: Camera, transform: Tensor, tolerance: float, backend: str) -> Tensor:
@@ -77,21 +74,14 @@ def fit_photographs(
             for index in mine:
                 shot = photograph(side.views, index, size, side.gaussians.means.device)
                 seen = _at(shot.camera, side.viewmat(shot.camera, transform).to(shot.camera.viewmat))
-                grey = torch.full((3,), GREY).to(seen.viewmat)
-                normal, right = picture_steps(side.gaussians, replace(shot, camera=seen), grey, backend).total()
+                normal, right = picture_steps(side.gaussians, replace(shot, camera=seen), backend).total()
                 A += by_motion.T @ normal[TWIST, TWIST] @ by_motion
                 b += right[TWIST] @ by_motion
-        step = torch.linalg.lstsq(A[None], b[None, :, None]).solution[0, :, 0]
+        step = torch.linalg.lstsq(A, b[:, None]).solution[:, 0]
         transform = se3.exp(step) @ transform
         if float(step.norm()) < SETTLED:
             break
     return transform
-
-
-def photograph(views: TrainingViews, index: int, size: int, device) -> TargetImage:
-    """A photograph before grey, on ``device``."""
-    shot = views.get(index, views.levels.index(size), torch.full((3,), GREY))
-    return TargetImage(shot.image.to(device), shot.alpha.to(device), None, shot.key, shot.camera.to(device))
 
 
 def compare(

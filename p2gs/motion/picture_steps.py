@@ -14,11 +14,10 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TargetImage
-from p2gs.gaussians.draw import render_gaussians
+from p2gs.motion.on_grey import drawing
+from p2gs.ops.robust import CAUCHY_95, MEDIAN_SIGMA, weighted_median
 from p2gs.types import Camera, GaussianTensors
 
-CAUCHY_95 = 2.385  # deviations: Rey 1983, DOI 10.1007/978-3-642-69389-2
-MEDIAN_SIGMA = 1.4826  # a normal deviate's sigma over its median size
 SHOWN = 0.3  # alpha from which a pixel shows a surface; below, its depth means little
 TOLD = 0.99  # of the slopes' squares: what is left out would make a motion surer by a hundredth
 LEAST_SIGMA = 1e-3  # a quarter of a photograph's grey level: no drawing is nearer
@@ -55,12 +54,10 @@ class PictureSteps:
 
 
 @torch.no_grad()
-def picture_steps(
-    g: GaussianTensors, shot: TargetImage, background: Tensor, backend: str, part: Tensor | None = None
-) -> PictureSteps:
-    """The pixels of ``shot``, which lies on ``background`` [3], that show a surface and have a slope, of these those of
+def picture_steps(g: GaussianTensors, shot: TargetImage, backend: str, part: Tensor | None = None) -> PictureSteps:
+    """The pixels of ``shot``, a photograph before grey, that show a surface and have a slope, of these those of
     ``part`` [H, W] (0 or 1) where it is given; float64 on the CPU."""
-    out = render_gaussians(g, shot.camera, background, backend=backend)
+    out = drawing(g, shot.camera, backend)
     drawn, photo, alpha = out.colour.cpu(), shot.image.cpu(), out.alpha.cpu()
     # a picture whose content moves by d changes by -slope d; the mean of both slopes converges twice as fast
     slope = -_gradient((drawn + photo) / 2)
@@ -108,13 +105,3 @@ def _weights(off: Tensor, slope: Tensor) -> Tensor:
     """[N, 3]: Cauchy's weights over the variance, which is the median error's where there is a slope to measure by."""
     sigma = MEDIAN_SIGMA * weighted_median(off.abs(), slope.square().sum(2)) + LEAST_SIGMA
     return 1 / (1 + (off / (CAUCHY_95 * sigma)) ** 2) / sigma**2
-
-
-def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """The value, a scalar, below which half of the weight lies; any shape, weights of one shape with the values. 0 of
-    none."""
-    if values.numel() == 0:
-        return values.new_zeros(())
-    order = values.flatten().argsort()
-    total = weights.flatten()[order].cumsum(0)
-    return values.flatten()[order[torch.searchsorted(total, total[-1] / 2).clamp_max(len(order) - 1)]]

@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
+from p2gs.ops.robust import MEDIAN_SIGMA
 from p2gs.visibility.depth_stack import DepthStack, StateEvidence
 
 
@@ -110,7 +111,7 @@ def measure_noise(stack: DepthStack, points: Tensor, normals: Tensor, limit: flo
     cosine = -(ray * normals[:, None]).sum(2)
     r = (stack.depth.reshape(-1)[index] - z) * cosine
     ok = inside & stack.valid.reshape(-1)[index] & (cosine > 0.4) & (r.abs() < limit)
-    return float(1.4826 * r[ok].abs().median()) if ok.any() else limit / 3
+    return float(MEDIAN_SIGMA * r[ok].abs().median()) if ok.any() else limit / 3
 
 
 def build_surfels(

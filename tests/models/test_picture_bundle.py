@@ -9,13 +9,13 @@ from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import ViewCorrections
 from p2gs.models.picture_bundle import adjust_pictures
 from p2gs.models.registered import correct_views
-from p2gs.motion.photo_fit import photograph
-from p2gs.motion.picture_steps import SHIFT, TWIST, picture_steps, steepest, weighted_median
+from p2gs.motion.on_grey import photograph
+from p2gs.motion.picture_steps import SHIFT, TWIST, picture_steps, steepest
 from p2gs.ops import se3
+from p2gs.ops.robust import weighted_median
 from p2gs.types import Camera
 
 SIZE = 64
-GREY = torch.full((3,), 0.5)
 
 
 def scene(count: int = 8):
@@ -35,7 +35,7 @@ def pixels(camera: Camera, viewmat: torch.Tensor, points: torch.Tensor) -> torch
 def test_moves_are_the_projections_derivatives():
     g, views = scene()
     shot = shot_of(views)
-    steps = picture_steps(g, shot, GREY, "auto")
+    steps = picture_steps(g, shot, "auto")
     V, h = shot.camera.viewmat.double(), 1e-6
     here = pixels(shot.camera, V, steps.points)
     assert (here.frac() - 0.5).abs().max() < 1e-5  # the points that pixels' centres show
@@ -49,7 +49,7 @@ def test_moves_are_the_projections_derivatives():
 
 def test_totals_are_sums_of_outer_products():
     g, views = scene(2)
-    steps = picture_steps(g, shot_of(views), GREY, "auto")
+    steps = picture_steps(g, shot_of(views), "auto")
     n, group = len(steps.points), torch.arange(len(steps.points)) % 3
     each = [
         (steps.moves[i].T @ steps.H[i] @ steps.moves[i], steps.moves[i].T @ steps.pull[i]) for i in range(n)
@@ -70,7 +70,7 @@ def test_one_camera_is_put_right():
     begin = V = true @ se3.exp(torch.tensor([0.012, -0.009, 0.006, 0.018, -0.012, 0.015]).double())
     for _ in range(10):
         at = replace(shot, camera=replace(shot.camera, viewmat=V.float()))
-        normal, right = picture_steps(g, at, GREY, "auto").total()
+        normal, right = picture_steps(g, at, "auto").total()
         V = V @ se3.exp(torch.linalg.solve(normal[TWIST, TWIST], right[TWIST]))
     points = g.means.double()
     first, last = ((pixels(shot.camera, X, points) - pixels(shot.camera, true, points)).norm(dim=1) for X in (begin, V))

@@ -20,6 +20,7 @@ from p2gs.data.capture.colmap_io import read_model, write_model
 from p2gs.data.capture.hypotheses import State, Votes
 from p2gs.data.capture.model import Model, similarity
 from p2gs.ops.knn import search_tree
+from p2gs.ops.robust import CAUCHY_95
 
 # reprojection error over the long edge for points found with the hypothesis known: half of what a vote may have
 GUIDED = 0.004
@@ -28,7 +29,6 @@ ALIKE = 0.8  # cosine of the mean descriptors of one point seen in both states
 MAX_ERROR = 3.0  # pixels: an observation worse than this is a wrong match; good ones are at 0.5 to 0.8
 END_OFFSET = 100_000  # image ids of the end state start here, so that they cannot meet the start's
 RAYLEIGH_MEDIAN = 1.1774  # of the length of a vector of two normal deviates
-CAUCHY_95 = 2.385  # deviations: Rey 1983, DOI 10.1007/978-3-642-69389-2
 LEAST_SCALE = 0.05  # pixels: no corner is known better than to a twentieth
 REFINED = 2  # times that observations are put where the pixels say; with the better poses once more
 ROUNDS = 2  # match, adjust; with the better poses once more

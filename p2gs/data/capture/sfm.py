@@ -17,8 +17,8 @@ import numpy as np
 
 VOTERS = 400  # features of largest scale that vote on which photographs may show the same thing
 MIN_VOTES = 4  # mutual best among them; by chance two photographs of different places have 0 to 2
-# thread of adjustments: several add up in another order each time, and half a millimetre of a plain room hung on that
-ONE = 1
+# threads of adjustments: several add up in another order each time, and half a millimetre of a plain room hung on that
+ADJUSTING = 1
 PARTNERS = 20  # photographs that each is matched with; a hand-held walk has about 6 neighbours at each of three heights
 
 
@@ -104,11 +104,10 @@ def _match(pycolmap, database: Path, job: dict, effort: Effort) -> None:
     options, checks = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     options.num_threads, options.use_gpu = job["threads"], False
     checks.ransac.random_seed = job["seed"]  # else each thread draws on from the pair that it had before
+    how = {"matching_options": options, "verification_options": checks, "device": pycolmap.Device.cpu}
     if not effort.preselect:
         say("matching every pair")
-        pycolmap.match_exhaustive(
-            database, matching_options=options, verification_options=checks, device=pycolmap.Device.cpu
-        )
+        pycolmap.match_exhaustive(database, **how)
         return
     pairs = _likely_pairs(pycolmap, database)
     say(f"matching {len(pairs)} pairs")
@@ -116,13 +115,7 @@ def _match(pycolmap, database: Path, job: dict, effort: Effort) -> None:
     listing.write_text("".join(f"{a} {b}\n" for a, b in pairs))
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = listing
-    pycolmap.match_image_pairs(
-        database,
-        matching_options=options,
-        pairing_options=pairing,
-        verification_options=checks,
-        device=pycolmap.Device.cpu,
-    )
+    pycolmap.match_image_pairs(database, pairing_options=pairing, **how)
 
 
 def _likely_pairs(pycolmap, database: Path) -> list[tuple[str, str]]:
@@ -168,7 +161,7 @@ def _unit(descriptors: np.ndarray) -> np.ndarray:
 def _map(pycolmap, database: Path, job: dict, effort: Effort, total: int):
     """(largest model or None, number of models)."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed, options.extract_colors = ONE, job["seed"], True
+    options.num_threads, options.random_seed, options.extract_colors = ADJUSTING, job["seed"], True
     options.min_model_size, options.max_num_models, options.ba_use_gpu = 3, 8, False
     options.mapper.init_min_num_inliers, options.mapper.init_min_tri_angle = effort.init_inliers, effort.init_angle
     options.mapper.abs_pose_min_num_inliers = effort.pose_inliers
@@ -216,7 +209,7 @@ def adjust(job: dict) -> dict:
     options.refine_principal_point, options.min_track_length, options.print_summary = job["principal_point"], 2, False
     ceres = options.ceres
     ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, job["scale"]
-    ceres.solver_options.num_threads, ceres.solver_options.max_num_iterations = ONE, job["iterations"]
+    ceres.solver_options.num_threads, ceres.solver_options.max_num_iterations = ADJUSTING, job["iterations"]
     ceres.use_gpu = False
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():

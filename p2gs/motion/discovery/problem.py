@@ -12,6 +12,7 @@ from torch import Tensor
 from p2gs.motion.discovery.config import DiscoveryConfig
 from p2gs.motion.discovery.fields import Landing, Scale
 from p2gs.motion.discovery.rigid import Motions
+from p2gs.ops.robust import MEDIAN_SIGMA
 from p2gs.visibility.depth_stack import DepthStack, StateEvidence, classify
 from p2gs.visibility.surfels import Surfels, build_surfels
 
@@ -150,7 +151,7 @@ def disagreement(surfels: list[Surfels], limit: float) -> float:
     j = torch.from_numpy(j)
     d = ((surfels[1].points[j] - surfels[0].points) * surfels[1].normals[j]).sum(1).abs()
     ok = (torch.from_numpy(near) < limit) & ((surfels[1].normals[j] * surfels[0].normals).sum(1) > 0.8)
-    return float(1.4826 * d[ok].median()) if ok.sum() > 20 else 0.0
+    return float(MEDIAN_SIGMA * d[ok].median()) if ok.sum() > 20 else 0.0
 
 
 def build_problem(start: StateEvidence, end: StateEvidence, config: DiscoveryConfig, seed: int) -> tuple[Problem, dict]:
