@@ -14,7 +14,7 @@ from p2gs.data.capture.gains import solve_gains
 from p2gs.data.capture.hypotheses import State, find_hypotheses
 from p2gs.data.capture.joint import END_OFFSET, filtered, guided_pairs, merged, state_bias, states_of
 from p2gs.data.capture.model import Lens, Model, Photo
-from p2gs.data.capture.static import board_link, check_board_link, choose
+from p2gs.data.capture.static import check_link, choose, link
 from p2gs.data.generated.synthetic import look_at
 from p2gs.types import UserError
 
@@ -197,13 +197,31 @@ def joined_by_corners(seen_end):
 
 
 def test_states_that_see_the_board_at_two_places_are_refused():
-    check_board_link(board_link(joined_by_corners(np.eye(4))), Path("x"))
+    check_link(link(joined_by_corners(np.eye(4))), True, Path("x"))
     moved, turned = np.eye(4), np.eye(4)
     moved[0, 3] = 0.01
     turned[:3, :3] = Rotation.from_euler("z", 0.4, degrees=True).as_matrix()
     for wrong in (moved, turned):
         with pytest.raises(UserError, match=r"the marker board .* 0\.\d\d % of the cameras' distance apart"):
-            check_board_link(board_link(joined_by_corners(wrong)), Path("x"))
+            check_link(link(joined_by_corners(wrong)), True, Path("x"))
     start, end, T = two_states(room=0, drawer=200)
     with pytest.raises(UserError, match="too rarely"):
-        check_board_link(board_link(merged(start.model, end.model, T, np.zeros((0, 2), np.int64))), Path("x"))
+        check_link(link(merged(start.model, end.model, T, np.zeros((0, 2), np.int64))), True, Path("x"))
+
+
+def test_states_that_few_points_join_are_refused():
+    """A plain room: a handful of the points that looked alike are seen often enough, or they say it only roughly."""
+    start, end, T = two_states(room=200, drawer=200)
+    pairs = guided_pairs(start, end, T)
+    joint = merged(start.model, end.model, T, pairs)
+    check_link(link(joint), False, Path("x"))
+    assert state_bias(merged(start.model, end.model, T, pairs[:20])).shift_sd > 1.5 * state_bias(joint).shift_sd
+    with pytest.raises(UserError, match=r"x: both states see what stands still too rarely; .*newspapers"):
+        check_link(link(merged(start.model, end.model, T, pairs[:5])), False, Path("x"))
+    rough = replace(end.model, xyz=end.model.xyz + 0.01 * np.random.default_rng(0).normal(size=end.model.xyz.shape))
+    seen = {
+        k: replace(p, xy=rough.pixels_of(k, rough.xyz[np.searchsorted(rough.ids, p.point)]))
+        for k, p in rough.photos.items()
+    }
+    with pytest.raises(UserError, match=r"both states see what stands still 0\.\d\d % of the cameras' distance apart"):
+        check_link(link(merged(start.model, replace(rough, photos=seen), T, pairs[:8])), False, Path("x"))

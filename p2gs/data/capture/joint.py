@@ -38,12 +38,14 @@ ROUNDS = 2  # match, adjust; with the better poses once more
 class Bias:
     """How far the states are apart after adjustment, by static points triangulated from each state alone.
 
-    shift: at the object's centre, in the model's units.  turn: degrees.  points: how many say so.  share: of all
-    points.
+    shift: at the object's centre, in the model's units.  turn: degrees.  shift_sd, turn_sd: standard deviations of
+    where these points can tell the states to lie.  points: how many say so.  share: of all points.
     """
 
     shift: float
     turn: float
+    shift_sd: float
+    turn_sd: float
     points: int
     share: float
 
@@ -255,7 +257,7 @@ def state_bias(model: Model) -> Bias:
     both = (na >= 3) & (nb >= 3) & np.isfinite(a).all(1) & np.isfinite(b).all(1)
     share = float(states_of(model).all(1).mean())
     if both.sum() < 6:
-        return Bias(float("nan"), float("nan"), int(both.sum()), share)
+        return Bias(*[float("nan")] * 4, int(both.sum()), share)
     a, b = a[both] - centre, b[both] - centre
     weight = np.ones(len(a))
     for _ in range(10):  # triangulation errors have long tails
@@ -263,4 +265,11 @@ def state_bias(model: Model) -> Bias:
         off = np.linalg.norm(a @ T[:3, :3].T + T[:3, 3] - b, axis=1)
         weight = 1 / (np.linalg.norm(a, axis=1) + distance) ** 2 / (1 + (off / (np.median(off) + 1e-12)) ** 2)
     turn = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
-    return Bias(float(np.linalg.norm(T[:3, 3])), float(turn), int(both.sum()), share)
+    J = np.concatenate([np.cross(np.eye(3)[None], b[:, None]), np.broadcast_to(np.eye(3), (len(b), 3, 3))], 1)
+    normal = np.einsum("n,nik,njk->ij", weight, J, J)  # of a turn about the centre and a shift
+    variance = (weight * off**2).sum() / (3 * len(b) - 6)
+    spread = variance * np.diag(np.linalg.pinv(normal, hermitian=True))
+    sd = np.sqrt([spread[3:].sum(), spread[:3].sum()])
+    return Bias(
+        float(np.linalg.norm(T[:3, 3])), float(turn), float(sd[0]), float(np.degrees(sd[1])), int(both.sum()), share
+    )

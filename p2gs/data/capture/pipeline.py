@@ -23,7 +23,7 @@ from p2gs.data.capture.hypotheses import Hypothesis, State
 from p2gs.data.capture.joint import is_end, join, state_bias, states_of
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred, lens_groups
-from p2gs.data.capture.static import LINKED, board_link, check_board_link, check_joint_support, choose, hypotheses_of
+from p2gs.data.capture.static import LINKED, check_joint_support, check_link, choose, hypotheses_of, link
 from p2gs.types import UserError
 
 STATES = ("start", "end")
@@ -235,10 +235,9 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
 
     def make() -> dict:
         model = joined(by_board=bool(chosen.board) and not chosen.wide)
-        if chosen.board and chosen.wide and not board_link(model) < LINKED:
+        if chosen.board and chosen.wide and not link(model) < LINKED:
             model = joined(by_board=True)  # a few points that hardly moved passed for the room
-        if chosen.board:
-            check_board_link(board_link(model), Path(shots[0].source).parent)
+        check_link(link(model), bool(chosen.board), Path(shots[0].source).parent)
         write_model(model, work / "joined")
         return {"corners": corners, "board_rms": board_rms}
 

@@ -16,7 +16,7 @@ from p2gs.types import UserError
 # of the cameras' distance: hypotheses that move the object's place by less than this are one; a board alone is as exact
 SAME = 0.04
 AROUND = 0.3  # of the cameras' distance: how far the object's surroundings go
-LINKED = 0.001  # of the cameras' distance: farther apart than this the states do not hang together by the board alone
+LINKED = 0.001  # of the cameras' distance: states that lie, or may lie, farther apart than this are not joined
 ADVICE = (
     "lay newspapers, a patterned rug or the printed board (p2gs data board) around the object and photograph "
     "both states again"
@@ -75,21 +75,26 @@ def choose(found: list[Hypothesis], given: int | None, where: Path) -> int:
     return 0
 
 
-def board_link(model: Model) -> float:
-    """How far apart the states see what stands still in both, the object's surroundings taken along, over the cameras'
-    distance; NaN where three photographs of each state show too little of it."""
+def link(model: Model) -> float:
+    """How far apart the states see what stands still in both, and how far it can be told (a standard deviation), the
+    object's surroundings taken along, over the cameras' distance; NaN where three photographs of each state show too
+    little of it."""
     bias, (_, distance) = state_bias(model), model.centre()
-    return float(bias.shift / distance + AROUND * np.radians(bias.turn))
+    return float((bias.shift + bias.shift_sd) / distance + AROUND * np.radians(bias.turn + bias.turn_sd))
 
 
-def check_board_link(apart: float, where: Path) -> None:
-    """Raises UserError where states that the marker board joins do not see it at one place (``board_link``)."""
+def check_link(apart: float, by_board: bool, where: Path) -> None:
+    """Raises UserError where joined states do not see what stands still at one place (``link``), or do not see enough
+    of it to say.  by_board: the marker board joins them."""
     if not apart < LINKED:
         seen = f"{100 * apart:.2f} % of the cameras' distance apart" if np.isfinite(apart) else "too rarely"
-        raise UserError(
-            f"{where}: little but the marker board is seen to stand still in both states, and they see it {seen}; lay "
-            "it where most photographs show it whole, or " + ADVICE
+        what = (
+            "little but the marker board is seen to stand still in both states, and they see it"
+            if by_board
+            else "both states see what stands still"
         )
+        more = "lay it where most photographs show it whole, or " if by_board else ""
+        raise UserError(f"{where}: {what} {seen}; {more}{ADVICE}")
 
 
 def check_joint_support(model: Model) -> dict:
