@@ -22,10 +22,12 @@ class ViewCorrections:
 
     motions [V, 4, 4] float64, internal units: the camera's viewmat is to be multiplied by it from the right.  log_gains
     [V, 3]: natural logarithm of how much brighter, in linear light, the photograph is than the state's mean one.
+    growths [V]: by how much its mask is too wide, as a share of the photograph's long edge.
     """
 
     motions: Tensor
     log_gains: Tensor
+    growths: Tensor
 
 
 @dataclass

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from p2gs.data.exposure import brightened, corrected
 from p2gs.gaussians.handover import Registration, StateGaussians, ViewCorrections
+from p2gs.models.mask_fit import regrown
 from p2gs.ops import se3
 from p2gs.ops.carry import Parts, carry
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
@@ -51,8 +52,10 @@ def register_views(scene: TwoStateScene, found: Registration) -> TwoStateScene:
     return scene.with_views(v if v.state == 0 else correct_view(v, back, found.log_gain) for v in scene.views)
 
 
-def correct_view(view: View, motion: Tensor, log_gain: Tensor) -> View:
-    """A photograph whose camera V becomes V motion [4, 4] and that loses ``log_gain`` [3]."""
+def correct_view(view: View, motion: Tensor, log_gain: Tensor, growth: float = 0.0) -> View:
+    """A photograph whose camera V becomes V motion [4, 4], that loses ``log_gain`` [3] and whose mask gets narrower by
+    ``growth`` (``regrown``)."""
+    view = regrown(view, growth)
     viewmat = (view.camera.viewmat.double() @ motion).float()
     image = view.image
     if bool(log_gain.any()):
@@ -65,7 +68,8 @@ def correct_views(views: Iterable[View], corrections: ViewCorrections | None) ->
     views = list(views)
     if corrections is None:
         return views
-    return [correct_view(v, m, g) for v, m, g in zip(views, corrections.motions, corrections.log_gains, strict=True)]
+    rows = zip(corrections.motions, corrections.log_gains, corrections.growths.tolist(), strict=True)
+    return [correct_view(v, *row) for v, row in zip(views, rows, strict=True)]
 
 
 def correct_scene(scene: TwoStateScene, states: list[StateGaussians]) -> TwoStateScene:
@@ -83,10 +87,10 @@ def write_registration(path: Path, found: Registration, states: list[StateGaussi
     similarity, images = scene.similarity, []
     for s in states:
         if s.corrections is not None:
-            for view, motion, gain in zip(
-                scene.select(s.state, "train"), s.corrections.motions, s.corrections.log_gains, strict=True
-            ):
-                told = {"motion": similarity.transform_to_input(motion).tolist(), "log_gain": gain.tolist()}
+            found_in = s.corrections
+            rows = zip(found_in.motions, found_in.log_gains.tolist(), found_in.growths.tolist(), strict=True)
+            for view, (motion, gain, growth) in zip(scene.select(s.state, "train"), rows, strict=True):
+                told = {"motion": similarity.transform_to_input(motion).tolist(), "log_gain": gain, "growth": growth}
                 images.append({"state": s.state, "name": view.name, **told})
     rows = {"transform": similarity.transform_to_input(found.transform).tolist(), "log_gain": found.log_gain.tolist()}
     path.write_text(
@@ -95,9 +99,9 @@ def write_registration(path: Path, found: Registration, states: list[StateGaussi
     )
 
 
-def read_registration(path: Path) -> tuple[Registration, dict[tuple[int, str], tuple[Tensor, Tensor]]]:
-    """What ``write_registration`` kept: the end's, and motion [4, 4] and gain [3] by state and name of a photograph;
-    nothing without a file."""
+def read_registration(path: Path) -> tuple[Registration, dict[tuple[int, str], tuple[Tensor, Tensor, float]]]:
+    """What ``write_registration`` kept: the end's, and motion [4, 4], gain [3] and growth of the mask by state and name
+    of a photograph; nothing without a file."""
     if not path.is_file():
         return Registration(torch.eye(4, dtype=torch.float64), torch.zeros(3)), {}
     stored = json.loads(path.read_text())
@@ -105,7 +109,11 @@ def read_registration(path: Path) -> tuple[Registration, dict[tuple[int, str], t
         torch.tensor(stored["transform"], dtype=torch.float64), torch.tensor(stored["log_gain"]), stored["figures"]
     )
     images = {
-        (i["state"], i["name"]): (torch.tensor(i["motion"], dtype=torch.float64), torch.tensor(i["log_gain"]))
+        (i["state"], i["name"]): (
+            torch.tensor(i["motion"], dtype=torch.float64),
+            torch.tensor(i["log_gain"]),
+            i.get("growth", 0.0),  # a file of an earlier build
+        )
         for i in stored["images"]
     }
     return found, images

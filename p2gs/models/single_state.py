@@ -19,10 +19,11 @@ from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs, Target
 from p2gs.models.health import check_gaussians
 from p2gs.models.initial import initial_points, isotropic_gaussians
+from p2gs.models.mask_fit import edge_distances, growths_of, try_masks
 from p2gs.models.phase import Phase, PhaseConfig, register_phase
 from p2gs.models.registered import correct_scene
 from p2gs.models.trial import Trial
-from p2gs.models.view_fit import ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
+from p2gs.models.view_fit import FIELDS, ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
 from p2gs.ops.decay import exponential
 from p2gs.types import Camera, GaussianTensors, RenderOutput, TwoStateScene
 from p2gs.visibility.share import visible_share
@@ -202,7 +203,7 @@ class SingleStatePhase(StatePhase):
         points, colours = initial_points(scene, state, config.initial_gaussians, config.init, self.generator(0, 2))
         self.splats = Splats(isotropic_gaussians(points, colours, config.initial_opacity, config.sh_degree))
         self.shots = scene.select(state=state, split="train")
-        self.errors, self.without_gains = ViewErrors(len(self.shots)), None
+        self.errors, self.put_right = ViewErrors(len(self.shots)), None
 
     def inputs(self, visit: Visit) -> LossInputs:
         step = visit.step
@@ -221,29 +222,42 @@ class SingleStatePhase(StatePhase):
 
     def forgive(self, step: int) -> None:
         """At their steps: decide which errors are looked for, cameras first, for a gain is told by pixels that lie on
-        one another; measure the gains; photographs lose the gains known."""
+        one another; measure gains and masks; photographs lose what is known of both; then all cameras."""
         config, errors = self.config.forgive, self.errors
         g, views = self.splats.tensors().detach(), self.views[self.state]
-        due = [round(share * self.total_steps) for share in (config.at, *config.measured)]
-        if step == due[0] and config.cameras == "auto":
+        first, *later = [round(share * self.total_steps) for share in (config.at, *config.measured)]
+        bundled = [round(share * self.total_steps) for share in config.bundled]
+        if step == first and config.cameras == "auto":
             self.decide(1, "cameras", try_cameras(g, views, config.levels[0], self.rasterizer))
-        if step in due[1:] and config.gains == "auto":
+        if step in later and config.gains == "auto":
             if not bool(errors.decided[0]):
                 self.decide(0, "gains", try_gains(g, views, errors, config, self.rasterizer))
             if bool(errors.on[0]):
                 errors.log_gains += measure_gains(g, views, errors, config.levels[0], self.rasterizer)
-        if bool(errors.on[1]) and step in [round(share * self.total_steps) for share in config.bundled]:
-            errors.adjust(g, views, self.level(step), self.rasterizer)
-        known = errors.log_gains.cpu()
-        if bool(known.any()) and (self.without_gains is None or not torch.equal(known, self.without_gains)):
+        if step in bundled and config.masks == "auto" and (bool(errors.on[2]) or not bool(errors.decided[2])):
+            self.measure_masks(self.level(step))
+        known = torch.cat([errors.log_gains, errors.growths[:, None]], 1).cpu()
+        if bool(known.any()) and (self.put_right is None or not torch.equal(known, self.put_right)):
             self.views[self.state] = TrainingViews(errors.views(self.shots), views.levels)
-            self.without_gains = known.clone()
+            self.put_right = known
+        if step in bundled and bool(errors.on[1]):
+            errors.adjust(g, self.views[self.state], self.level(step), self.rasterizer)
+
+    def measure_masks(self, size: int) -> None:
+        """How wide masks are by pictures of ``size`` pixels; the first time, whether that is looked for."""
+        g, errors = self.splats.tensors().detach(), self.errors
+        shots = list(errors.shots(self.views[self.state], size, g.means.device))
+        edges = [edge_distances(g, shot, self.rasterizer) for shot in shots]
+        if not bool(errors.decided[2]):
+            self.decide(2, "masks", try_masks(edges, [tuple(shot.alpha.shape) for shot in shots], FIELDS))
+        if bool(errors.on[2]):
+            errors.growths += growths_of(edges)
 
     def decide(self, which: int, name: str, found: Trial) -> None:
-        """Switch gains (0) or cameras (1) on where held-out halves say so, and tell."""
+        """Switch gains (0), cameras (1) or masks (2) on where held-out halves say so, and tell."""
         self.errors.decided[which] = True
         forgive = self.config.forgive
-        self.errors.on[which] = found.passed((forgive.least, forgive.least_cameras)[which])
+        self.errors.on[which] = found.passed((forgive.least, forgive.least_cameras, forgive.least)[which])
         outcome = "on" if self.errors.on[which] else "off"
         print(f"{self.phase_name}: {name} of single photographs: {found.told()}: {outcome}", flush=True)
 

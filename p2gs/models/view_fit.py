@@ -1,5 +1,5 @@
-"""Small errors of single photographs, found beside the Gaussians: each one's exposure and white balance, and its
-camera.
+"""Small errors of single photographs, found beside the Gaussians: each one's exposure and white balance, its camera,
+and how wide its mask is (``mask_fit``).
 
 A camera goes from V to V exp(xi), xi a twist in world coordinates about the origin (the middle of the object's box):
 all of them moved alike would be the object moved, so the mean of xi is held at zero. So is that of the gains'
@@ -10,7 +10,7 @@ themselves: each is halved like a chessboard, and what is fitted to one half mus
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, Sequence
+from typing import Iterator, Literal, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -36,17 +36,19 @@ FIELDS = 8  # a side: each half of a photograph shows something of every part
 class ViewFitConfig:
     """What may be wrong with single photographs.
 
-    gains, cameras: "auto" (photographs decide, once) or "never".  at: share of the phase that is done when they decide
-    on cameras.  measured: shares at which gains are measured; at the first, with the cameras put right, they decide on
-    them.  bundled: shares at which all cameras are put right at once, by all pixels of the size that is trained on
-    (``picture_bundle``); between them each follows the model by its gradient.  levels: the size of the photographs that
-    decide, pixels.  rate: of the cameras' Adam in internal units, falling to a hundredth.  least: share by which the
-    other halves' errors must fall; least_cameras: the same of cameras, which explain a coarse model's errors too: of
-    clean scenes 3 to 4.3 %, of cameras off by a tenth of a degree 17.6 to 34 %.
+    gains, cameras, masks: "auto" (photographs decide, once) or "never".  at: share of the phase that is done when they
+    decide on cameras.  measured: shares at which gains are measured; at the first, with the cameras put right, they
+    decide on them.  bundled: shares at which masks are measured, the first time to decide on them, and then all cameras
+    are put right at once, by all pixels of the size that is trained on (``picture_bundle``); between them each follows
+    the model by its gradient.  levels: the size of the photographs that decide, pixels.  rate: of the cameras' Adam in
+    internal units, falling to a hundredth.  least: share by which the other halves' errors must fall (of masks: clean
+    scenes at most .3 %, masks off by up to two pixels 12.6 to 15.8 %); least_cameras: the same of cameras, which
+    explain a coarse model's errors too: of clean scenes 3 to 4.3 %, of cameras off by a tenth of a degree 17.6 to 34 %.
     """
 
     gains: Literal["auto", "never"] = "never"
     cameras: Literal["auto", "never"] = "never"
+    masks: Literal["auto", "never"] = "never"
     at: float = 0.12
     measured: list[float] = field(default_factory=lambda: [0.2, 0.5])
     bundled: list[float] = field(default_factory=lambda: [0.2, 0.4, 0.6, 0.8])
@@ -83,12 +85,14 @@ class RowAdam:
 class ViewErrors(nn.Module):
     """The errors of V photographs of one state: buffers, so that a checkpoint has them.
 
-    twists [V, 6] and log_gains [V, 3], float64; their means are zero.  on, decided [2] bool: of gains and cameras.
+    twists [V, 6], log_gains [V, 3] and growths [V], float64; their means are zero.  on, decided [3] bool: of gains,
+    cameras and masks.
     """
 
     twists: Tensor
     moments: Tensor
     log_gains: Tensor
+    growths: Tensor
     on: Tensor
     decided: Tensor
 
@@ -97,8 +101,9 @@ class ViewErrors(nn.Module):
         self.register_buffer("twists", torch.zeros(count, 6, dtype=torch.float64))
         self.register_buffer("moments", torch.zeros(count, 13, dtype=torch.float64))
         self.register_buffer("log_gains", torch.zeros(count, 3, dtype=torch.float64))
-        self.register_buffer("on", torch.zeros(2, dtype=torch.bool))
-        self.register_buffer("decided", torch.zeros(2, dtype=torch.bool))
+        self.register_buffer("growths", torch.zeros(count, dtype=torch.float64))
+        self.register_buffer("on", torch.zeros(3, dtype=torch.bool))
+        self.register_buffer("decided", torch.zeros(3, dtype=torch.bool))
         self._looked_at: tuple[int, Tensor] | None = None
 
     def camera(self, index: int, camera: Camera) -> Camera:
@@ -115,11 +120,15 @@ class ViewErrors(nn.Module):
         """The photograph's camera as it is known by now, without gradient."""
         return turned(camera, self.twists[index]) if bool(self.on[1]) else camera
 
+    def shots(self, views: TrainingViews, size: int, device) -> Iterator[TargetImage]:
+        """The photographs before grey, ``size`` pixels long, with the cameras known by now."""
+        photos = (photograph(views, i, size, device) for i in range(len(views)))
+        return (replace(shot, camera=self.found(i, shot.camera)) for i, shot in enumerate(photos))
+
+    @torch.no_grad()
     def adjust(self, g: GaussianTensors, views: TrainingViews, size: int, backend: str) -> None:
         """All cameras at once, by bundle adjustment of the pictures of ``size`` pixels."""
-        photos = (photograph(views, i, size, g.means.device) for i in range(len(views)))
-        shots = (replace(shot, camera=self.found(i, shot.camera)) for i, shot in enumerate(photos))
-        twists = adjust_pictures(g, shots, backend)
+        twists = adjust_pictures(g, self.shots(views, size, g.means.device), backend)
         self.twists.copy_(se3.log(se3.exp(self.twists.cpu()) @ se3.exp(twists)))
         self.twists -= self.twists.mean(0)
 
@@ -132,15 +141,15 @@ class ViewErrors(nn.Module):
         self.twists -= self.twists.mean(0)
 
     def views(self, shots: Sequence[View]) -> list[View]:
-        """The photographs without their gains, their cameras as they were."""
+        """The photographs without their gains and with their masks put right, their cameras as they were."""
         still = torch.eye(4, dtype=torch.float64).expand(len(shots), 4, 4)
-        return correct_views(shots, ViewCorrections(still, self.log_gains.cpu()))
+        return correct_views(shots, ViewCorrections(still, self.log_gains.cpu(), self.growths.cpu()))
 
     def handed_over(self) -> ViewCorrections | None:
         """What later stages need; None where all is off."""
         if not bool(self.on.any()):
             return None
-        return ViewCorrections(se3.exp(self.twists.cpu()), self.log_gains.float().cpu())
+        return ViewCorrections(se3.exp(self.twists.cpu()), self.log_gains.float().cpu(), self.growths.cpu())
 
 
 @torch.no_grad()

@@ -82,7 +82,7 @@ def test_all_cameras_at_once():
     g, views = scene()
     twists = 0.006 * torch.randn(len(views), 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     twists -= twists.mean(0)
-    shots = correct_views(views, ViewCorrections(se3.exp(twists), torch.zeros(len(views), 3)))
+    shots = correct_views(views, ViewCorrections(se3.exp(twists), torch.zeros(len(views), 3), torch.zeros(len(views))))
     photos, found = [shot_of(shots, k) for k in range(len(shots))], torch.zeros(len(views), 6).double()
     for _ in range(3):
         known = [

@@ -211,7 +211,7 @@ def test_kept_in_the_inputs_coordinates(tmp_path):
         register_views(correct_scene(inner, states), found).views, as_fitted(outer, tmp_path).views, strict=True
     ):
         assert torch.allclose(camera_to_input(want.camera, similarity).viewmat, got.camera.viewmat, atol=1e-5)
-        assert torch.equal(want.image, got.image)
+        assert torch.equal(want.image, got.image) and torch.equal(want.alpha, got.alpha)
     assert read_registration(tmp_path / "registration.json")[0].figures == {"share": 0.7}
     assert as_fitted(outer, tmp_path / "none") is outer
 
@@ -219,5 +219,7 @@ def test_kept_in_the_inputs_coordinates(tmp_path):
 def corrections(count: int, seed: int) -> ViewCorrections:
     gen = torch.Generator().manual_seed(seed)
     return ViewCorrections(
-        se3.exp(0.01 * torch.randn(count, 6, generator=gen).double()), 0.1 * torch.randn(count, 3, generator=gen)
+        se3.exp(0.01 * torch.randn(count, 6, generator=gen).double()),
+        0.1 * torch.randn(count, 3, generator=gen),
+        0.02 * torch.randn(count, generator=gen).double(),
     )

@@ -33,7 +33,7 @@ def moved(views, size: float, seed: int = 0):
     """Cameras off by twists of mean zero and ``size`` (rms of each entry)."""
     twists = size * torch.randn(len(views), 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     twists -= twists.mean(0)
-    return correct_views(views, ViewCorrections(se3.exp(twists), torch.zeros(len(views), 3)))
+    return correct_views(views, ViewCorrections(se3.exp(twists), torch.zeros(len(views), 3), torch.zeros(len(views))))
 
 
 def exposed(views, size: float):
@@ -112,13 +112,16 @@ def test_halves(shape):
 def test_handed_over(tmp_path):
     g, _ = textured_panels(10)
     given = StateGaussians(
-        1, g, ViewCorrections(se3.exp(torch.full((2, 6), 0.01).double()), torch.tensor([[0.1, 0, -0.1]] * 2))
+        1,
+        g,
+        ViewCorrections(
+            se3.exp(torch.full((2, 6), 0.01).double()), torch.tensor([[0.1, 0, -0.1]] * 2), torch.tensor([0.01, -0.01])
+        ),
     )
     save(given, tmp_path / "s.pt")
     read = load(tmp_path / "s.pt")[0]
-    assert torch.equal(read.corrections.motions, given.corrections.motions) and torch.equal(
-        read.corrections.log_gains, given.corrections.log_gains
-    )
+    for name in ("motions", "log_gains", "growths"):
+        assert torch.equal(getattr(read.corrections, name), getattr(given.corrections, name))
 
 
 def test_a_phase_decides():
