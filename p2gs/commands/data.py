@@ -131,7 +131,7 @@ def capture(args: argparse.Namespace) -> int:
     options = Options(
         masks=None if args.masks is None else Path(args.masks), ignore=args.mask_means == "ignore",
         poses=None if args.poses is None else Path(args.poses), static=args.static, height=args.height,
-        box=None if args.box is None else tuple(args.box),
+        box=None if args.box is None else tuple(args.box), mask_model=args.mask_model,
         max_views=args.max_views, size=args.size, careful=args.careful,
     )  # fmt: skip
     folder = capture_scene(

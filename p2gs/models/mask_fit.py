@@ -24,7 +24,8 @@ from p2gs.types import GaussianTensors, View
 
 def signed_distance(inside: np.ndarray) -> np.ndarray:
     """[H, W] pixels from the edge between True and False, positive inside; ``inside`` [H, W] bool has both."""
-    return np.where(inside, distance_transform_edt(inside) - 0.5, 0.5 - distance_transform_edt(~inside))
+    within, beside = (np.asarray(distance_transform_edt(x)) for x in (inside, ~inside))
+    return np.where(inside, within - 0.5, 0.5 - beside)
 
 
 def middle_mean(values: np.ndarray) -> float:
@@ -38,7 +39,7 @@ def edge_distances(g: GaussianTensors, shot: TargetImage, backend: str) -> np.nd
     lie, as a share of the whole picture's long edge; None where there is no edge or no outline."""
     drawn = drawing(g, shot.camera, backend).alpha.cpu().numpy() > 0.5
     mask = shot.alpha.cpu().numpy() > 0.5
-    edge = (mask & binary_dilation(~mask)) | (~mask & binary_dilation(mask))
+    edge = (mask & np.asarray(binary_dilation(~mask))) | (~mask & np.asarray(binary_dilation(mask)))
     if not edge.any() or drawn.all() or not drawn.any():
         return None
     y, x = np.nonzero(edge)
@@ -56,7 +57,7 @@ def growths_of(edges: list[np.ndarray | None]) -> Tensor:
     return found - found.mean()
 
 
-def try_masks(edges: list[np.ndarray | None], shapes: list[tuple[int, int]], fields: int) -> Trial:
+def try_masks(edges: list[np.ndarray | None], shapes: list[torch.Size], fields: int) -> Trial:
     """Distances of half edges from the drawn outlines as they are, and after the growth that their other halves tell,
     as it differs from the photographs' mean. shapes: (height, width) of the pictures; halves are those of a chessboard
     of ``fields`` fields a side."""
@@ -87,6 +88,6 @@ def regrown(view: View, growth: float) -> View:
     if not (alpha > 0.5).any():
         return view
     image = view.image.numpy()
-    nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    image = np.where(inside[..., None], image, image[tuple(nearest)])
+    row, column = np.asarray(distance_transform_edt(~inside, return_distances=False, return_indices=True))
+    image = np.where(inside[..., None], image, image[row, column])
     return replace(view, image=torch.from_numpy(image), alpha=torch.from_numpy((alpha * 255).round().astype(np.uint8)))

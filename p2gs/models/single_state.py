@@ -249,7 +249,7 @@ class SingleStatePhase(StatePhase):
         shots = list(errors.shots(self.views[self.state], size, g.means.device))
         edges = [edge_distances(g, shot, self.rasterizer) for shot in shots]
         if not bool(errors.decided[2]):
-            self.decide(2, "masks", try_masks(edges, [tuple(shot.alpha.shape) for shot in shots], FIELDS))
+            self.decide(2, "masks", try_masks(edges, [shot.alpha.shape for shot in shots], FIELDS))
         if bool(errors.on[2]):
             errors.growths += growths_of(edges)
 

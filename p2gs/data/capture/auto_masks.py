@@ -14,6 +14,7 @@ from p2gs.data.capture.coarse import Picture, Region, Splat, fit, initial, objec
 from p2gs.data.capture.hull import Hull, hull_of
 from p2gs.data.capture.joint import is_end, states_of
 from p2gs.data.capture.model import Model
+from p2gs.data.capture.segmenters import Segmenter
 from p2gs.data.capture.write import pinhole_of
 from p2gs.data.exposure import corrected
 from p2gs.types import Camera, UserError
@@ -23,6 +24,7 @@ SHARP = 480  # px, long edge that edges are sharpened at
 BAND = 0.012  # of the long edge, to either side of the drawn edge: two pixels of the splat's pictures
 PORE = 0.03  # of the mask: smaller holes are the coarse splat's, where a plain side gave it nothing to hold on to
 CHANGED = 0.15  # share of the mask that sharpening may change before it is not believed
+ALIKE = 0.5  # intersection over union of a model's mask with what the splat shows, below which it means something else
 
 
 def pictures_of(model: Model, photos: Path, gains: dict[int, np.ndarray], keys: list[int], size: int) -> list[Picture]:
@@ -88,19 +90,44 @@ def shares(splat: Splat, rows: torch.Tensor, camera: Camera) -> np.ndarray:
         return splat.render(camera, features=rows[:, None].float()).features[..., 0].numpy()
 
 
-def object_in(splat: Splat, rows: torch.Tensor, hull: Hull, coarse: Camera, sharp: Picture) -> np.ndarray:
-    """[h, w] bool: the object in ``sharp``: what the splat shows within the hull, its edge sharpened. coarse: the
-    photograph's camera at the size that the hull was made by."""
+def object_in(
+    splat: Splat, rows: torch.Tensor, hull: Hull, coarse: Camera, sharp: Picture, segmenter: Segmenter | None = None
+) -> tuple[np.ndarray, bool]:
+    """[h, w] bool: the object in ``sharp``: what the splat shows within the hull, its edge sharpened or drawn by the
+    segmenter; and whether that was believed. coarse: the photograph's camera at the size that the hull was made by."""
     import cv2
 
     share = shares(splat, rows, sharp.camera)
     outline = cv2.resize(hull.outline(coarse).astype(np.float32), share.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return sharpened((255 * sharp.image.numpy()).astype(np.uint8), np.where(outline > 0.5, share, 0.0))
+    image, share = (255 * sharp.image.numpy()).astype(np.uint8), np.where(outline > 0.5, share, 0.0)
+    if segmenter is None or not (share > 0.5).any():
+        return sharpened(image, share), True
+    found = segmented(segmenter, image, share, outline > 0.5)
+    return (sharpened(image, share), False) if found is None else (found, True)
 
 
-def state_masks(model: Model, photos: Path, gains: dict, region: Region, end: bool) -> dict[str, np.ndarray]:
+def segmented(segmenter: Segmenter, image: np.ndarray, share: np.ndarray, outline: np.ndarray) -> np.ndarray | None:
+    """[h, w] bool: the object by a model, within the hull's ``outline`` [h, w] and a band around it; None where it is
+    another thing than the splat's ``share`` [h, w] shows."""
+    import cv2
+
+    drawn = share > 0.5
+    reach = max(round(BAND * max(drawn.shape)), 2)
+    within = cv2.dilate(outline.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+    found = segmenter(image, drawn) & within
+    return found if (found & drawn).sum() >= ALIKE * (found | drawn).sum() else None
+
+
+def state_masks(
+    model: Model,
+    photos: Path,
+    gains: dict,
+    region: Region,
+    end: bool,
+    segmenter: Segmenter | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> dict[str, np.ndarray]:
     """Masks [H, W] uint8 in the copies' (distorted) pixels of one state's photographs, by name."""
-
     keys = [k for k, p in model.photos.items() if is_end(p.name) == end]
     mine = states_of(model)[:, int(end)]
     splat = initial(region, model.xyz[mine], model.rgb[mine])
@@ -112,13 +139,17 @@ def state_masks(model: Model, photos: Path, gains: dict, region: Region, end: bo
         raise UserError(
             f"the object could not be told from the room in state '{'end' if end else 'start'}'; give --masks DIR"
         )
-    out = {}
+    out, others = {}, 0
     for key, coarse, sharp in zip(keys, pictures, pictures_of(model, photos, gains, keys, SHARP), strict=True):
-        mask = without_pores(object_in(splat, rows, hull, coarse.camera, sharp))
+        found, believed = object_in(splat, rows, hull, coarse.camera, sharp, segmenter)
+        mask, others = without_pores(found), others + (not believed)
         photo = model.photos[key]
         out[photo.name] = distorted(mask, model.lenses[photo.lens])
         if not out[photo.name].any():
             del out[photo.name]
+    if others:
+        state = "end" if end else "start"
+        progress(f"{state}: in {others} photographs the model found another thing; there the edge is GrabCut's")
     return out
 
 
@@ -143,12 +174,14 @@ def auto_masks(
     gains: dict,
     progress: Callable[[str], None] = lambda text: None,
     box: np.ndarray | None = None,
+    segmenter: Segmenter | None = None,
 ) -> dict[str, np.ndarray]:
     """Masks of both states by photograph's name. model: z up, floor at 0.  box: [2, 3] within which the object is in
-    both states (None: what the cameras look at)."""
+    both states (None: what the cameras look at).  segmenter: draws edges (None: GrabCut does)."""
     centre, distance = model.centre()
     centre = np.array([*centre[:2], max(centre[2], 0.1 * distance)]) if box is None else box.mean(0)
     cameras = np.array([p.position for p in model.photos.values()])
     region = replace(region_of(model.xyz, cameras, centre, distance), box=box)
     progress(f"masks: a coarse fit of each state ({len(region.planes) - 1} walls)")
-    return state_masks(model, photos, gains, region, False) | state_masks(model, photos, gains, region, True)
+    both = [state_masks(model, photos, gains, region, end, segmenter, progress) for end in (False, True)]
+    return both[0] | both[1]

@@ -257,7 +257,7 @@ def state_bias(model: Model) -> Bias:
     both = (na >= 3) & (nb >= 3) & np.isfinite(a).all(1) & np.isfinite(b).all(1)
     share = float(states_of(model).all(1).mean())
     if both.sum() < 6:
-        return Bias(*[float("nan")] * 4, int(both.sum()), share)
+        return Bias(np.nan, np.nan, np.nan, np.nan, int(both.sum()), share)
     a, b = a[both] - centre, b[both] - centre
     weight = np.ones(len(a))
     for _ in range(10):  # triangulation errors have long tails

@@ -23,6 +23,7 @@ from p2gs.data.capture.hypotheses import Hypothesis, State
 from p2gs.data.capture.joint import is_end, join, state_bias, states_of
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred, lens_groups
+from p2gs.data.capture.segmenters import segmenter_of
 from p2gs.data.capture.static import LINKED, check_joint_support, check_link, choose, hypotheses_of, link
 from p2gs.types import UserError
 
@@ -39,7 +40,8 @@ Progress = Callable[[str], None]
 class Options:
     """masks: folder of masks.  ignore: nerfstudio's meaning of them.  poses: COLMAP model or transforms.json.  static:
     number of the hypothesis to take.  height: metres of the object.  box: x0 y0 z0 x1 y1 z1 that the object is within,
-    as capture.html has it.  max_views: photographs a state.  size: long edge in pixels."""
+    as capture.html has it.  mask_model: draws masks' edges (``segmenters``).  max_views: photographs a state.  size:
+    long edge in pixels."""
 
     masks: Optional[Path] = None
     ignore: bool = False
@@ -47,6 +49,7 @@ class Options:
     static: Optional[int] = None
     height: Optional[float] = None
     box: Optional[tuple[float, ...]] = None
+    mask_model: Optional[str] = None
     max_views: int = 60
     size: int = 1600
     careful: bool = False
@@ -84,6 +87,7 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     carry it."""
     if out.is_file() or (out.is_dir() and any(out.iterdir()) and not (out / ".capture").is_dir()):
         raise UserError(f"{out}: is there already and was not made by p2gs data capture; expected a new folder")
+    segmenter = None if options.mask_model is None else segmenter_of(options.mask_model)
     cache = Cache(out / ".capture")
     work = cache.folder
     shots, left_out = _photos({"start": start, "end": end}, work, cache, options, progress)
@@ -101,10 +105,12 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     found = gains.photo_gains(model, work / "photos")
     model, about = world.oriented(model, corners)
     if masks is None:
-        masks = auto_masks(model, work / "photos", found, progress, world.given_box(options.box, about, out))
+        within = world.given_box(options.box, about, out)
+        masks = auto_masks(model, work / "photos", found, progress, within, segmenter)
         _keep(masks, out / "masks")
     model = world.scaled(model, masks, options.height, about)
-    facts = about | facts | {"masks": "given" if options.masks else "alpha" if shots[0].alpha else "auto"}
+    source = "given" if options.masks else "alpha" if shots[0].alpha else options.mask_model or "auto"
+    facts = about | facts | {"masks": source}
     progress("writing")
     files = write.write_scene(model, work / "photos", masks, found, out)
     box = world.box_of(model, masks)
