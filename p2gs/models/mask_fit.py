@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.ndimage import binary_dilation, distance_transform_edt
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from p2gs.data.views import TargetImage
@@ -39,7 +39,7 @@ def edge_distances(g: GaussianTensors, shot: TargetImage, backend: str) -> np.nd
     lie, as a share of the whole picture's long edge; None where there is no edge or no outline."""
     drawn = drawing(g, shot.camera, backend).alpha.cpu().numpy() > 0.5
     mask = shot.alpha.cpu().numpy() > 0.5
-    edge = (mask & np.asarray(binary_dilation(~mask))) | (~mask & np.asarray(binary_dilation(mask)))
+    edge = np.abs(signed_distance(mask)) < 1 if mask.any() and not mask.all() else np.zeros_like(mask)
     if not edge.any() or drawn.all() or not drawn.any():
         return None
     y, x = np.nonzero(edge)
