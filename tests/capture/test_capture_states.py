@@ -223,5 +223,7 @@ def test_states_that_few_points_join_are_refused():
         k: replace(p, xy=rough.pixels_of(k, rough.xyz[np.searchsorted(rough.ids, p.point)]))
         for k, p in rough.photos.items()
     }
-    with pytest.raises(UserError, match=r"both states see what stands still 0\.\d\d % of the cameras' distance apart"):
+    with pytest.raises(
+        UserError, match=r"both states see what stands still up to 0\.\d\d % of the cameras' distance apart"
+    ):
         check_link(link(merged(start.model, replace(rough, photos=seen), T, pairs[:8])), False, Path("x"))

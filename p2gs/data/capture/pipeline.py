@@ -243,7 +243,6 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
         model = joined(by_board=bool(chosen.board) and not chosen.wide)
         if chosen.board and chosen.wide and not link(model) < LINKED:
             model = joined(by_board=True)  # a few points that hardly moved passed for the room
-        check_link(link(model), bool(chosen.board), Path(shots[0].source).parent)
         write_model(model, work / "joined")
         return {"corners": corners, "board_rms": board_rms}
 
@@ -251,7 +250,9 @@ def _solved(shots: list[Shot], work: Path, cache: Cache, options: Options, progr
     corners = {int(k): v for k, v in result["corners"].items()}
     if result.get("board_rms") is not None:  # before the board was held
         facts["board_rms_mm"] = round(1000 * result["board_rms"], 2)
-    return read_model(work / "joined"), corners, facts
+    model = read_model(work / "joined")
+    check_link(link(model), bool(chosen.board), Path(shots[0].source).parent)
+    return model, corners, facts
 
 
 def _check_arc(model: Model, state: str) -> None:

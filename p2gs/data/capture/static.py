@@ -87,7 +87,7 @@ def check_link(apart: float, by_board: bool, where: Path) -> None:
     """Raises UserError where joined states do not see what stands still at one place (``link``), or do not see enough
     of it to say.  by_board: the marker board joins them."""
     if not apart < LINKED:
-        seen = f"{100 * apart:.2f} % of the cameras' distance apart" if np.isfinite(apart) else "too rarely"
+        seen = f"up to {100 * apart:.2f} % of the cameras' distance apart" if np.isfinite(apart) else "too rarely"
         what = (
             "little but the marker board is seen to stand still in both states, and they see it"
             if by_board
