@@ -42,7 +42,7 @@ class ViewFitConfig:
     are put right at once, by all pixels of the size that is trained on (``picture_bundle``); between them each follows
     the model by its gradient.  levels: the size of the photographs that decide, pixels.  rate: of the cameras' Adam in
     internal units, falling to a hundredth.  least: share by which the other halves' errors must fall (of masks: clean
-    scenes at most .3 %, masks off by up to two pixels 12.6 to 15.8 %); least_cameras: the same of cameras, which
+    scenes at most 0.8 %, masks off by up to two pixels 11.8 to 16.5 %); least_cameras: the same of cameras, which
     explain a coarse model's errors too: of clean scenes 3 to 4.3 %, of cameras off by a tenth of a degree 17.6 to 34 %.
     """
 
