@@ -194,11 +194,12 @@ def parser(prog: str = "p2gs") -> Parser:
     )
     means: dict[str, Any] = {"choices": ("object", "ignore"), "default": "object", "help": "ignore: nerfstudio's masks"}
     capture.add_argument("--mask_means", "--mask-means", **means)
-    means = {
-        "metavar": "MODEL",
-        "help": "draws the masks' edges: FILE.onnx, or sam2:CONFIG:CHECKPOINT (default: GrabCut)",
-    }
-    capture.add_argument("--mask_model", "--mask-model", **means)
+    capture.add_argument(
+        "--mask_model",
+        "--mask-model",
+        metavar="MODEL",
+        help="draws the masks' edges: FILE.onnx, or sam2:CONFIG:CHECKPOINT (default: GrabCut)",
+    )
     capture.add_argument(
         "--poses", metavar="PATH", help="a COLMAP model or transforms.json of both states: no structure from motion"
     )

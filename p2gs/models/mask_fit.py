@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from p2gs.data.views import TargetImage
-from p2gs.models.trial import Trial, trial
+from p2gs.models.trial import Trial, halves, trial
 from p2gs.motion.on_grey import drawing
 from p2gs.types import GaussianTensors, View
 
@@ -35,15 +35,16 @@ def middle_mean(values: np.ndarray) -> float:
 
 
 def edge_distances(g: GaussianTensors, shot: TargetImage, backend: str) -> np.ndarray | None:
-    """[n, 3]: row and column of the pixels on both sides of a mask's edge, and how far outside the drawn outline they
-    lie, as a share of the whole picture's long edge; None where there is no edge or no outline."""
+    """[n, 2] of the pixels on both sides of a mask's edge: which half of the picture they are in (0 or 1), and how far
+    outside the drawn outline they lie, as a share of the whole picture's long edge; None where there is no edge or no
+    outline."""
     drawn = drawing(g, shot.camera, backend).alpha.cpu().numpy() > 0.5
     mask = shot.alpha.cpu().numpy() > 0.5
     edge = np.abs(signed_distance(mask)) < 1 if mask.any() and not mask.all() else np.zeros_like(mask)
     if not edge.any() or drawn.all() or not drawn.any():
         return None
-    y, x = np.nonzero(edge)
-    return np.stack([y, x, -signed_distance(drawn)[y, x] / long_edge(shot)], 1)
+    half = halves(*mask.shape)[0].numpy()
+    return np.stack([half[edge], -signed_distance(drawn)[edge] / long_edge(shot)], 1)
 
 
 def long_edge(shot: TargetImage) -> int:
@@ -53,19 +54,15 @@ def long_edge(shot: TargetImage) -> int:
 
 def growths_of(edges: list[np.ndarray | None]) -> Tensor:
     """[V] float64: by how much each mask is too wide, share of the long edge, mean zero; 0 where none can tell."""
-    found = torch.tensor([0.0 if e is None else middle_mean(e[:, 2]) for e in edges], dtype=torch.float64)
+    found = torch.tensor([0.0 if e is None else middle_mean(e[:, 1]) for e in edges], dtype=torch.float64)
     return found - found.mean()
 
 
-def try_masks(edges: list[np.ndarray | None], shapes: list[torch.Size], fields: int) -> Trial:
+def try_masks(edges: list[np.ndarray | None]) -> Trial:
     """Distances of half edges from the drawn outlines as they are, and after the growth that their other halves tell,
-    as it differs from the photographs' mean. shapes: (height, width) of the pictures; halves are those of a chessboard
-    of ``fields`` fields a side."""
-    halved = []
-    for edge, (height, width) in zip(edges, shapes, strict=True):
-        if edge is not None:
-            black = (edge[:, 0] * fields // height + edge[:, 1] * fields // width) % 2 < 1
-            halved += [(edge[black, 2], edge[~black, 2])] if black.any() and not black.all() else []
+    as it differs from the photographs' mean."""
+    split = [[e[e[:, 0] == half, 1] for half in (0, 1)] for e in edges if e is not None]
+    halved = [both for both in split if all(map(len, both))]
     if len(halved) < 2:
         return trial(torch.ones(1), torch.ones(1))
     told = np.array([[middle_mean(half) for half in both] for both in halved])
@@ -83,11 +80,11 @@ def regrown(view: View, growth: float) -> View:
     inside = view.alpha.numpy() > 127
     if growth == 0 or not inside.any() or inside.all():
         return view
-    distance = signed_distance(inside) - growth * max(inside.shape)
-    alpha = np.clip(distance + 0.5, 0, 1)
+    alpha = np.clip(signed_distance(inside) - growth * max(inside.shape) + 0.5, 0, 1)
     if not (alpha > 0.5).any():
         return view
-    image = view.image.numpy()
+    right = replace(view, alpha=torch.from_numpy((alpha * 255).round().astype(np.uint8)))
+    if growth > 0:
+        return right  # nothing comes in
     row, column = np.asarray(distance_transform_edt(~inside, return_distances=False, return_indices=True))
-    image = np.where(inside[..., None], image, image[row, column])
-    return replace(view, image=torch.from_numpy(image), alpha=torch.from_numpy((alpha * 255).round().astype(np.uint8)))
+    return replace(right, image=view.image[row, column])

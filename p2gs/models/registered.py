@@ -87,9 +87,9 @@ def write_registration(path: Path, found: Registration, states: list[StateGaussi
     similarity, images = scene.similarity, []
     for s in states:
         if s.corrections is not None:
-            found_in = s.corrections
-            rows = zip(found_in.motions, found_in.log_gains.tolist(), found_in.growths.tolist(), strict=True)
-            for view, (motion, gain, growth) in zip(scene.select(s.state, "train"), rows, strict=True):
+            c = s.corrections
+            each = zip(c.motions, c.log_gains.tolist(), c.growths.tolist(), strict=True)
+            for view, (motion, gain, growth) in zip(scene.select(s.state, "train"), each, strict=True):
                 told = {"motion": similarity.transform_to_input(motion).tolist(), "log_gain": gain, "growth": growth}
                 images.append({"state": s.state, "name": view.name, **told})
     rows = {"transform": similarity.transform_to_input(found.transform).tolist(), "log_gain": found.log_gain.tolist()}

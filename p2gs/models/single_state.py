@@ -23,7 +23,7 @@ from p2gs.models.mask_fit import edge_distances, growths_of, try_masks
 from p2gs.models.phase import Phase, PhaseConfig, register_phase
 from p2gs.models.registered import correct_scene
 from p2gs.models.trial import Trial
-from p2gs.models.view_fit import FIELDS, ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
+from p2gs.models.view_fit import ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
 from p2gs.ops.decay import exponential
 from p2gs.types import Camera, GaussianTensors, RenderOutput, TwoStateScene
 from p2gs.visibility.share import visible_share
@@ -246,10 +246,10 @@ class SingleStatePhase(StatePhase):
     def measure_masks(self, size: int) -> None:
         """How wide masks are by pictures of ``size`` pixels; the first time, whether that is looked for."""
         g, errors = self.splats.tensors().detach(), self.errors
-        shots = list(errors.shots(self.views[self.state], size, g.means.device))
+        shots = errors.shots(self.views[self.state], size, g.means.device)
         edges = [edge_distances(g, shot, self.rasterizer) for shot in shots]
         if not bool(errors.decided[2]):
-            self.decide(2, "masks", try_masks(edges, [shot.alpha.shape for shot in shots], FIELDS))
+            self.decide(2, "masks", try_masks(edges))
         if bool(errors.on[2]):
             errors.growths += growths_of(edges)
 

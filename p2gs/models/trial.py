@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
+FIELDS = 8  # a side: each half of a photograph shows something of every part
 CERTAIN = 3.0  # standard errors: one in a thousand by chance
 
 
@@ -44,3 +46,10 @@ def held_out(count: int, every: int = 4) -> tuple[list[int], list[int]]:
     out = list(range(every // 2, count, every))
     kept = [i for i in range(count) if i not in set(out)]
     return (kept, out) if len(out) > 1 and len(kept) > 1 else (list(range(count)), list(range(count)))
+
+
+def halves(height: int, width: int) -> list[Tensor]:
+    """The two colours of a chessboard of ``FIELDS`` fields a side, [H, W] of 0 and 1 each."""
+    y, x = torch.arange(height) * FIELDS // height, torch.arange(width) * FIELDS // width
+    black = ((y[:, None] + x[None]) % 2).float()
+    return [black, 1 - black]

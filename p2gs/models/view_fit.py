@@ -20,7 +20,7 @@ from p2gs.data.views import TargetImage, TrainingViews
 from p2gs.gaussians.handover import ViewCorrections
 from p2gs.models.picture_bundle import TWIST_SIGMA, adjust_pictures
 from p2gs.models.registered import correct_views
-from p2gs.models.trial import Trial, trial
+from p2gs.models.trial import Trial, halves, trial
 from p2gs.motion.on_grey import drawing, photograph
 from p2gs.motion.photo_fit import STRUCTURE
 from p2gs.motion.picture_steps import TWIST, picture_steps
@@ -29,7 +29,6 @@ from p2gs.ops.ssim import l1_ssim
 from p2gs.types import Camera, GaussianTensors, View
 
 LOOKS = 3  # of Gauss and Newton at half a photograph; each leaves a third to a half of what is left
-FIELDS = 8  # a side: each half of a photograph shows something of every part
 
 
 @dataclass
@@ -157,20 +156,11 @@ def measure_gains(g: GaussianTensors, views: TrainingViews, errors: ViewErrors, 
     """Natural logarithm [V, 3], float64, of how much brighter each photograph is than its rendering, mean zero; 0 where
     none can tell.  errors: what is known of the cameras."""
     found = torch.zeros(len(views), 3, dtype=torch.float64)
-    for index in range(len(views)):
-        shot = photograph(views, index, size, g.means.device)
-        camera = errors.found(index, shot.camera)
-        out = drawing(g, camera, backend)
+    for index, shot in enumerate(errors.shots(views, size, g.means.device)):
+        out = drawing(g, shot.camera, backend)
         gain = median_gain(shot.image, out.colour, (shot.alpha > 0.99) & (out.alpha > 0.99))
         found[index] = 0 if gain is None else gain.double().cpu()
     return found - found.mean(0)
-
-
-def halves(height: int, width: int) -> list[Tensor]:
-    """The two colours of a chessboard of ``FIELDS`` fields a side, [H, W] of 0 and 1 each."""
-    y, x = torch.arange(height) * FIELDS // height, torch.arange(width) * FIELDS // width
-    black = ((y[:, None] + x[None]) % 2).float()
-    return [black, 1 - black]
 
 
 @torch.no_grad()
@@ -180,10 +170,8 @@ def try_gains(
     """Errors of half photographs without and with the gain that their other half tells, as it differs from the
     photographs' mean.  errors: what is known of the cameras."""
     drawn = []
-    for index in range(len(views)):
-        shot = photograph(views, index, config.levels[0], g.means.device)
-        camera = errors.found(index, shot.camera)
-        out = drawing(g, camera, backend)
+    for shot in errors.shots(views, config.levels[0], g.means.device):
+        out = drawing(g, shot.camera, backend)
         inside = (shot.alpha > 0.99) & (out.alpha > 0.99)
         both = [half.to(g.means) for half in halves(*inside.shape)]
         gains = [median_gain(shot.image, out.colour, inside & (half > 0)) for half in both]

@@ -14,7 +14,8 @@ from p2gs.gaussians.handover import StateGaussians, ViewCorrections, load, save
 from p2gs.gaussians.splats import Splats
 from p2gs.models.registered import correct_views
 from p2gs.models.single_state import SingleStateConfig, SingleStatePhase
-from p2gs.models.view_fit import ViewErrors, ViewFitConfig, halves, measure_gains, try_cameras, try_gains
+from p2gs.models.trial import halves
+from p2gs.models.view_fit import ViewErrors, ViewFitConfig, measure_gains, try_cameras, try_gains
 from p2gs.ops import se3
 from p2gs.ops.decay import exponential
 from p2gs.ops.ssim import l1_ssim

@@ -46,13 +46,18 @@ def pictures_of(model: Model, photos: Path, gains: dict[int, np.ndarray], keys: 
     return out
 
 
+def band(shape: tuple[int, ...]) -> int:
+    """Pixels to either side of a drawn edge within which the true one lies, in a picture of ``shape``."""
+    return max(round(BAND * max(shape)), 2)
+
+
 def sharpened(image: np.ndarray, share: np.ndarray) -> np.ndarray:
     """[h, w] bool: the object by GrabCut in a band around the edge of ``share`` [h, w] float (what the splat says).
     image: uint8 RGB."""
     import cv2
 
     drawn = (share > 0.5).astype(np.uint8)
-    reach = max(round(BAND * max(drawn.shape)), 2)
+    reach = band(drawn.shape)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     inner, outer = cv2.erode(drawn, kernel), cv2.dilate(drawn, kernel)
     if not inner.any() or outer.all():
@@ -112,7 +117,7 @@ def segmented(segmenter: Segmenter, image: np.ndarray, share: np.ndarray, outlin
     import cv2
 
     drawn = share > 0.5
-    reach = max(round(BAND * max(drawn.shape)), 2)
+    reach = band(drawn.shape)
     within = cv2.dilate(outline.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
     found = segmenter(image, drawn) & within
     return found if (found & drawn).sum() >= ALIKE * (found | drawn).sum() else None
@@ -128,7 +133,7 @@ def state_masks(
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, np.ndarray]:
     """Masks [H, W] uint8 in the copies' (distorted) pixels of one state's photographs, by name."""
-    keys = [k for k, p in model.photos.items() if is_end(p.name) == end]
+    state, keys = "end" if end else "start", [k for k, p in model.photos.items() if is_end(p.name) == end]
     mine = states_of(model)[:, int(end)]
     splat = initial(region, model.xyz[mine], model.rgb[mine])
     pictures = pictures_of(model, photos, gains, keys, COARSE)
@@ -136,9 +141,7 @@ def state_masks(
     rows = object_rows(splat, region)
     hull = hull_of(region, [(p.camera, shares(splat, rows, p.camera) > 0.5) for p in pictures])
     if len(hull.points) == 0:
-        raise UserError(
-            f"the object could not be told from the room in state '{'end' if end else 'start'}'; give --masks DIR"
-        )
+        raise UserError(f"the object could not be told from the room in state '{state}'; give --masks DIR")
     out, others = {}, 0
     for key, coarse, sharp in zip(keys, pictures, pictures_of(model, photos, gains, keys, SHARP), strict=True):
         found, believed = object_in(splat, rows, hull, coarse.camera, sharp, segmenter)
@@ -148,7 +151,6 @@ def state_masks(
         if not out[photo.name].any():
             del out[photo.name]
     if others:
-        state = "end" if end else "start"
         progress(f"{state}: in {others} photographs the model found another thing; there the edge is GrabCut's")
     return out
 

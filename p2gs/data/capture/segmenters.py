@@ -12,7 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from p2gs.data.box import mask_bounds
 from p2gs.types import UserError
 
 Segmenter = Callable[
@@ -46,11 +48,11 @@ def segmenter_of(name: str) -> Segmenter:
 
 def frame_of(asked: np.ndarray, around: float) -> tuple[slice, slice]:
     """Rows and columns around what is true in ``asked`` [h, w], wider by ``around`` of the longer side."""
-    y, x = np.nonzero(asked)
-    margin = round(around * max(np.ptp(y), np.ptp(x)))
-    spans = ((max(v.min() - margin, 0), min(v.max() + 1 + margin, n)) for v, n in zip((y, x), asked.shape, strict=True))
-    rows, columns = (slice(int(lo), int(hi)) for lo, hi in spans)
-    return rows, columns
+    x0, y0, x1, y1 = mask_bounds(torch.from_numpy(asked))
+    margin = round(around * (max(x1 - x0, y1 - y0) - 1))
+    height, width = asked.shape
+    rows = slice(max(y0 - margin, 0), min(y1 + margin, height))
+    return rows, slice(max(x0 - margin, 0), min(x1 + margin, width))
 
 
 def net_segmenter(session) -> Segmenter:
@@ -92,8 +94,6 @@ def sam2_segmenter(name: str) -> Segmenter:
         from sam2.sam2_image_predictor import SAM2ImagePredictor
     except ImportError as err:
         raise UserError(f"--mask_model {name} is run by SAM 2, which is not installed: pip install sam2") from err
-    import torch
-
     device = "cuda" if torch.cuda.is_available() else "cpu"
     predictor = SAM2ImagePredictor(build_sam2(config, checkpoint, device=device))
 
