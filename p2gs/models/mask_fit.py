@@ -40,7 +40,7 @@ def edge_distances(g: GaussianTensors, shot: TargetImage, backend: str) -> np.nd
     outline."""
     drawn = drawing(g, shot.camera, backend).alpha.cpu().numpy() > 0.5
     mask = shot.alpha.cpu().numpy() > 0.5
-    edge = np.abs(signed_distance(mask)) < 1 if mask.any() and not mask.all() else np.zeros_like(mask)
+    edge = np.abs(signed_distance(mask)) == 0.5 if mask.any() and not mask.all() else np.zeros_like(mask)
     if not edge.any() or drawn.all() or not drawn.any():
         return None
     half = halves(*mask.shape)[0].numpy()
