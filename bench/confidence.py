@@ -32,8 +32,8 @@ from p2gs.motion.discovery.problem import build_problem
 from p2gs.motion.discovery.search import Search
 from p2gs.motion.joint_confidence import JointEvidence, common_level, features, nudges, state_depth
 from p2gs.motion.refine_motions import Judge, refine, single_ways
+from p2gs.motion.relabel import label_gaussians
 from p2gs.ops import se3
-from p2gs.parts.settle import label_gaussians
 from p2gs.visibility.evidence import gather_evidence
 
 

@@ -21,8 +21,8 @@ from p2gs.motion.discovery import discover, relabel
 from p2gs.motion.discovery.labels import Graph
 from p2gs.motion.discovery.problem import build_problem
 from p2gs.motion.refine_motions import Judge
+from p2gs.motion.relabel import label_gaussians
 from p2gs.ops import se3
-from p2gs.parts.settle import label_gaussians
 from p2gs.visibility.evidence import gather_evidence
 
 

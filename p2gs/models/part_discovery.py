@@ -17,6 +17,7 @@ from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.models.stage import Stage, register_phase
 from p2gs.motion.discovery import Discovery, StateEvidence, discover, relabel
 from p2gs.motion.refine_motions import Judge
+from p2gs.motion.relabel import label_gaussians
 from p2gs.motion.survey import leave_false_minima
 from p2gs.native import at_once
 from p2gs.parts.askew import lay_axes
@@ -25,7 +26,7 @@ from p2gs.parts.expand import expand
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import join_twins, settle_types, simplify
 from p2gs.parts.seek import seek
-from p2gs.parts.settle import drop_unfounded, label_gaussians, reconsider, settle_labels
+from p2gs.parts.settle import drop_unfounded, reconsider, settle_labels
 from p2gs.parts.slots import merge_to
 from p2gs.types import TwoStateScene, UserError
 from p2gs.visibility.evidence import gather_evidence
@@ -142,7 +143,7 @@ def _improved(
     """Types settled, bodies told apart, false minima left, each part reconsidered; what was done."""
     motions = settle_types(judge, motions, config.compare_types_below, config.freedom_penalty)
     motions, changed = _bodies(judge, motions, limit)
-    motions, shifted = leave_false_minima(judge, motions, config.survey)
+    motions, shifted = leave_false_minima(judge, motions, config.survey, config.candidates)
     if config.reconsider:
         say("reconsidering each part")
         motions, reconsidered = reconsider(judge, motions, limit, config)

@@ -3,31 +3,39 @@ place, a minimum of its own, centimetres from the true one, that no descent leav
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Iterator
 
 import torch
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.refine_motions import Judge
+from p2gs.motion.relabel import relabelled
 from p2gs.motion.screw_polish import allowed_step, apply_step
 from p2gs.ops import se3
 
 
-def survey(judge: Judge, motions: PartMotions, reach: list[float]) -> tuple[PartMotions, list[int]]:
-    """Lay each part, shifted within its own surface, where the smallest photographs are explained best (``Judge.gain``,
-    without surfaces); a refinement goes on from there.
+def survey(
+    judge: Judge, motions: PartMotions, reach: list[float], candidates: int = 3
+) -> tuple[PartMotions, list[int]]:
+    """Lay each part, shifted within its own surface, where the energy is lowest by the smallest photographs
+    (``Judge.gain``); a refinement goes on from there.
 
-    reach: shifts tried to both sides of the part's two long directions (internal units). Returns the motions and which
-    of them moved.
+    reach: shifts tried to both sides of the part's two long directions (internal units).  candidates: of a part's
+    shifts, how many that the surfaces like best are looked at, with labels chosen anew: those that suit a wrong place
+    hold the part there.  Without surfaces (``judge.found``) labels stay, and all shifts are looked at. Returns the
+    motions and which of them moved.
     """
-    glance = replace(judge.at_a_glance(judge.config.steps), found=None)
-    moved = []
+    glance, moved = judge.at_a_glance(judge.config.steps), []
     for k in range(len(motions)):
-        laid = motions
-        for tried in _shifted(judge, motions, k, reach):
+        laid, tries = motions, list(_shifted(judge, motions, k, reach))
+        if judge.found is None:
             # by its own pixels first: that is one look instead of three
-            if glance.cost(tried) < glance.cost(laid) and glance.gain(tried, laid) > 0:
+            tries = [tried for tried in tries if glance.cost(tried) < glance.cost(motions)]
+        else:
+            best = sorted(tries, key=judge.surfaces)[:candidates]
+            tries = [relabelled(judge.found, judge.states, tried) for tried in best]
+        for tried in tries:
+            if glance.gain(tried, laid) > 0:
                 laid = tried
         if laid is not motions:
             motions = laid
@@ -55,7 +63,9 @@ def _shifted(judge: Judge, motions: PartMotions, k: int, reach: list[float]) -> 
             yield motions.with_motion(k, kind, se3.project_revolute(at_end) if kind == "revolute" else at_end)
 
 
-def leave_false_minima(judge: Judge, motions: PartMotions, reach: list[float]) -> tuple[PartMotions, list[int]]:
+def leave_false_minima(
+    judge: Judge, motions: PartMotions, reach: list[float], candidates: int = 3
+) -> tuple[PartMotions, list[int]]:
     """Refined motions once more from where ``survey`` lays the parts, as long as that gains, and no oftener than there
     are parts and shifts: gains of several steps do not add up, so they might lead round in a circle.
 
@@ -63,7 +73,7 @@ def leave_false_minima(judge: Judge, motions: PartMotions, reach: list[float]) -
     """
     gone: list[int] = []
     for _ in range(len(motions) * len(reach) if judge.config.steps > 0 else 0):
-        surveyed, moved = survey(judge, motions, reach)
+        surveyed, moved = survey(judge, motions, reach, candidates)
         if not moved:
             break
         surveyed = judge.improved(surveyed)[2]

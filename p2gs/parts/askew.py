@@ -13,7 +13,7 @@ from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.directions import KNOWN, WITHIN, axis_of, directions_of, shared_axes, turned_onto
 from p2gs.motion.discovery.rigid import one_way
 from p2gs.motion.refine_motions import Judge
-from p2gs.parts.settle import relabelled
+from p2gs.motion.relabel import relabelled
 
 
 def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMotions, list[dict]]:

@@ -8,8 +8,8 @@ from operator import itemgetter
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.discovery import left_over
 from p2gs.motion.refine_motions import Judge
+from p2gs.motion.relabel import relabelled
 from p2gs.parts.options import PartMotionsConfig
-from p2gs.parts.settle import relabelled
 
 FEWEST = 20  # Gaussians of a part in each state
 

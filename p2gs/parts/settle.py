@@ -8,15 +8,14 @@ from functools import partial
 from operator import itemgetter
 
 import torch
-from torch import Tensor
 
-from p2gs.gaussians.handover import PartMotions, StateGaussians
+from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.directions import LINE, directions_of
-from p2gs.motion.discovery import Candidate, Discovery, in_rows, in_two, instead_of, places_changed, relabel
+from p2gs.motion.discovery import Discovery, in_rows, in_two, instead_of, places_changed
 from p2gs.motion.refine_motions import Judge
+from p2gs.motion.relabel import relabelled
 from p2gs.native import at_once
 from p2gs.ops import se3
-from p2gs.ops.sh import dc_to_rgb
 from p2gs.parts.islands import settle_islands
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import lonely, settle_types, without_part
@@ -24,16 +23,6 @@ from p2gs.parts.part_choices import lonely, settle_types, without_part
 # Of a proposal's energy (a log ratio of image losses), the most by which refining is taken to lower it: of 245
 # proposals on fourteen objects no accepted one stood above 0.042 before it, and none of the 88 above this came so low.
 REACH = 0.15
-
-
-def label_gaussians(explanation: Candidate, states: list[StateGaussians]) -> tuple[list[Tensor], list[Tensor]]:
-    """Label and margin [N] of every Gaussian (also the faint ones) of both states."""
-    labels, margin = [], []
-    for state, s in enumerate(states):
-        lab, mar = explanation.label_points(s.gaussians.means, dc_to_rgb(s.gaussians.sh[:, 0]).clamp(0, 1), state)
-        labels.append(torch.as_tensor(lab, dtype=torch.int64))
-        margin.append(torch.as_tensor(mar, dtype=torch.float32))
-    return labels, margin
 
 
 def reconsider(
@@ -132,15 +121,6 @@ def _proposed(found: Discovery, states, motions: PartMotions, proposals: list[tu
         tried = replace(motions, types=types, transforms=transforms, confidence=torch.zeros(len(types)))
         out.append((k, relabelled(found, states, tried)))
     return out
-
-
-def relabelled(found: Discovery, states, motions: PartMotions) -> PartMotions:
-    """The same motions with labels chosen anew, and discovery's confidence in them under these."""
-    explanation = relabel(found, motions.transforms, motions.types)
-    labels, margin = label_gaussians(explanation, states)
-    return replace(
-        motions, labels=labels, margin=margin, confidence=torch.tensor([m.confidence for m in explanation.motions])
-    )
 
 
 def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:

@@ -1,6 +1,6 @@
 """Pieces of a part that hang apart from it, and shifted parts that cover themselves."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -110,24 +110,28 @@ def test_facing_turns_with_the_part():
     assert float(facing(x, z, torch.zeros(1, 3), camera.position)) == pytest.approx(-1.0, abs=1e-6)
 
 
+def shifted(truth, labels, means, size):
+    """The motion, and a place beside its own along the part's long direction, ``size`` away."""
+    points = se3.apply(truth, means[labels == 1].double())
+    long, axis = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2][0], se3.screw_parameters(truth).axis
+    long = long - (axis * (long @ axis) if se3.screw_parameters(truth).angle > 0.1 else 0)
+    off = truth.clone()
+    off[:3, 3] += size * long / long.norm()
+    return off
+
+
+SURVEYED = PolishConfig(
+    steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0
+)
+
+
 @pytest.mark.parametrize("kind, truth", [("prismatic", slide()), ("revolute", hinge())])
 def test_survey_leaves_a_false_minimum(kind, truth):
     states, labels, views = two_states(truth)
-    centre = se3.apply(truth, states[0].gaussians.means[labels == 1].double()).mean(0)
-    off = truth.clone()
-    points = se3.apply(truth, states[0].gaussians.means[labels == 1].double()) - centre
-    long = torch.linalg.svd(points, full_matrices=False)[2][0]
-    long = long - (
-        se3.screw_parameters(truth).axis * (long @ se3.screw_parameters(truth).axis) if kind == "revolute" else 0
-    )
-    off[:3, 3] += 0.12 * long / long.norm()
-    margins = [torch.ones(len(labels))] * 2
-    motions = PartMotions([kind], off[None], torch.ones(1), [labels, labels], margins)
-    config = PolishConfig(
-        steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0
-    )
+    off = shifted(truth, labels, states[0].gaussians.means, 0.12)
+    motions = PartMotions([kind], off[None], torch.ones(1), [labels, labels], [torch.ones(len(labels))] * 2)
     stacks = [None, None]  # not looked at: nothing is left out, all views count
-    judge = Judge(SimpleNamespace(search=None), states, views, config, stacks, 0, "auto")
+    judge = Judge(None, states, views, SURVEYED, stacks, 0, "auto")
     assert survey(judge, motions, [])[1] == []
     moved, which = survey(judge, motions, [0.06, 0.12])
     error = [float((T[:3, 3] - truth[:3, 3]).norm()) for T in (off, moved.transforms[0])]
@@ -135,6 +139,34 @@ def test_survey_leaves_a_false_minimum(kind, truth):
     better, which = leave_false_minima(judge, motions, [0.06, 0.12])
     assert which == [0] and float((better.transforms[0, :3, 3] - truth[:3, 3]).norm()) < 0.02
     assert leave_false_minima(judge, motions, []) == (motions, [])
+
+
+def test_survey_chooses_labels_anew_for_what_surfaces_like_best(monkeypatch):
+    """A motion's false place keeps the labels that suit it: of the part only what arrives on the true one."""
+    truth, asked = slide(), []
+    states, labels, views = two_states(truth)
+    means = states[0].gaussians.means
+    off = shifted(truth, labels, means, 0.12)
+    place = se3.apply(truth, means[labels == 1].double())
+
+    def chosen(found, states, motions):
+        at = se3.apply(motions.transforms[0], means.double())
+        arrives = torch.cdist(at, place).min(1).values < 0.03
+        asked.append(float((motions.transforms[0] - truth)[:3, 3].norm()))
+        new = torch.where(arrives, labels, 0)
+        return replace(motions, labels=[new, labels])
+
+    monkeypatch.setattr("p2gs.motion.survey.relabelled", chosen)
+    liked = lambda found, T, types: float((T[0] - truth)[:3, 3].norm())  # noqa: E731
+    monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", liked)
+    margins = [torch.ones(len(labels))] * 2
+    motions = chosen(None, states, PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], margins))
+    assert int((motions.labels[0] == 1).sum()) < 0.9 * int((labels == 1).sum())
+    judge = Judge(object(), states, views, SURVEYED, [None, None], 0, "auto")  # type: ignore[arg-type]
+    asked.clear()
+    moved, which = survey(judge, motions, [0.06, 0.12], candidates=2)
+    assert which == [0] and asked == sorted(asked) and len(asked) == 2 and asked[0] < 0.02
+    assert torch.equal(moved.labels[0], labels) and float((moved.transforms[0] - truth).norm()) < 0.02
 
 
 @pytest.mark.parametrize("wall_in_front", [True, False])

@@ -36,9 +36,9 @@ def scene(monkeypatch):
     margins = [torch.ones(len(labels))] * 2
     sure = SimpleNamespace(confidence=0.5)
     monkeypatch.setattr(
-        settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
+        "p2gs.motion.relabel.relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
     )
-    monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
+    monkeypatch.setattr("p2gs.motion.relabel.label_gaussians", lambda *a: ([labels, labels], margins))
 
     def reconsider(kind, T, proposed, more=(), limit=1):
         monkeypatch.setattr(
@@ -92,10 +92,11 @@ def second_owns_the_panel(monkeypatch):
     off = slide()
     off[:3, 3] += torch.tensor([0.0, 0.05, 0.0])
     monkeypatch.setattr(
-        settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
+        "p2gs.motion.relabel.relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
     )
     monkeypatch.setattr(
-        settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins)
+        "p2gs.motion.relabel.label_gaussians",
+        lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins),
     )
     return states, labels, views, margins, off
 
@@ -122,9 +123,9 @@ def test_a_part_that_was_found_turned_over_is_turned_back(monkeypatch):
     states, labels, views = two_states(hinge())
     margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.5)
     monkeypatch.setattr(
-        settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
+        "p2gs.motion.relabel.relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
     )
-    monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
+    monkeypatch.setattr("p2gs.motion.relabel.label_gaussians", lambda *a: ([labels, labels], margins))
     monkeypatch.setattr(settle, "instead_of", lambda *a: [])
     points = states[0].gaussians.means[labels == 1].double()
     upright = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2]
@@ -168,10 +169,11 @@ def test_what_is_sought_must_save_its_share_once_refined(monkeypatch):
     states, labels, views = two_states(slide())
     margins, sure = [torch.ones(len(labels))] * 2, SimpleNamespace(confidence=0.5)
     monkeypatch.setattr(
-        settle, "relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
+        "p2gs.motion.relabel.relabel", lambda found, transforms, types: SimpleNamespace(motions=[sure] * len(types))
     )
     monkeypatch.setattr(
-        settle, "label_gaussians", lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins)
+        "p2gs.motion.relabel.label_gaussians",
+        lambda explanation, states: ([labels * len(explanation.motions)] * 2, margins),
     )
     near = slide()
     near[:3, 3] += torch.tensor([0.02, -0.02, 0.02])
@@ -212,8 +214,8 @@ def test_a_part_of_which_one_state_shows_nothing_is_dropped(monkeypatch):
         told.append(list(types))
         return SimpleNamespace(motions=[SimpleNamespace(confidence=0.5)] * len(types))
 
-    monkeypatch.setattr(settle, "relabel", relabel)
-    monkeypatch.setattr(settle, "label_gaussians", lambda *a: ([labels, labels], margins))
+    monkeypatch.setattr("p2gs.motion.relabel.relabel", relabel)
+    monkeypatch.setattr("p2gs.motion.relabel.label_gaussians", lambda *a: ([labels, labels], margins))
     judge = judge_of(states, views)
     two = PartMotions(
         ["revolute", "prismatic"], torch.stack([hinge(), slide()]), torch.tensor([0.01, 0.4]), [labels * 2] * 2, margins
