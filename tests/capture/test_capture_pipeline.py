@@ -1,8 +1,10 @@
 """The command from poses to a scene, the child process, and scores in true metres."""
 
 import json
+import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +15,7 @@ from p2gs.app import run
 from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
 from p2gs.data.capture.model import Lens, Model, Photo
+from p2gs.data.capture.static import loose_poses
 from p2gs.data.check import check_dataset
 from p2gs.data.generated.raytrace import render
 from p2gs.data.generated.shapes import box
@@ -93,13 +96,26 @@ def test_a_folder_of_something_else_is_not_written_into(capture, tmp_path, capsy
     assert "expected a new folder" in capsys.readouterr().err
 
 
-def test_a_narrow_arc_is_refused(capture, tmp_path, capsys):
+def test_a_narrow_arc_is_refused_and_states_apart_are_told(capture, tmp_path, capsys):
     model = read_model(capture / "sparse")
+    assert loose_poses(model) is None
     model.photos = {k: p for k, p in model.photos.items() if p.name[-5] in "345"}
+    for photo in model.photos.values():
+        if photo.name.startswith("end/"):
+            photo.viewmat[:3, 3] += photo.viewmat[:3, :3] @ [0, 0, 0.01]  # 1 cm lower, of 2.4 m
     write_model(model, tmp_path / "narrow")
     words = ["data", "capture", str(capture / "start"), str(capture / "end"), "--out", str(tmp_path / "s")]
     assert run([*words, "--masks", str(capture / "masks"), "--poses", str(tmp_path / "narrow")]) == 2
-    assert "degrees around the object" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "degrees around the object" in told.err
+    assert re.search(r"narrow: both states see what stands still up to 0\.[3-6]\d % of the cameras' distance", told.out)
+
+
+def test_poses_without_points_cannot_be_checked(capture):
+    model = read_model(capture / "sparse")
+    none = replace(model, ids=model.ids[:0], xyz=model.xyz[:0], rgb=model.rgb[:0])
+    none.photos = {k: replace(p, xy=p.xy[:0], point=p.point[:0]) for k, p in model.photos.items()}
+    assert "too few points are seen in both states" in (loose_poses(none) or "")
 
 
 def test_the_child_adjusts_a_model(capture, tmp_path):

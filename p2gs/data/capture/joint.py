@@ -255,7 +255,7 @@ def state_bias(model: Model) -> Bias:
     centre, distance = model.centre()
     (a, na), (b, nb) = triangulated(model, False), triangulated(model, True)
     both = (na >= 3) & (nb >= 3) & np.isfinite(a).all(1) & np.isfinite(b).all(1)
-    share = float(states_of(model).all(1).mean())
+    share = float(states_of(model).all(1).mean()) if len(model.ids) else 0.0
     if both.sum() < 6:
         return Bias(np.nan, np.nan, np.nan, np.nan, int(both.sum()), share)
     a, b = a[both] - centre, b[both] - centre

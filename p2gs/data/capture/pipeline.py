@@ -24,7 +24,15 @@ from p2gs.data.capture.joint import is_end, join, state_bias, states_of
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred, lens_groups
 from p2gs.data.capture.segmenters import segmenter_of
-from p2gs.data.capture.static import LINKED, check_joint_support, check_link, choose, hypotheses_of, link
+from p2gs.data.capture.static import (
+    LINKED,
+    check_joint_support,
+    check_link,
+    choose,
+    hypotheses_of,
+    link,
+    loose_poses,
+)
 from p2gs.types import UserError
 
 STATES = ("start", "end")
@@ -32,7 +40,6 @@ FORMAT = "p2gs-capture/1"
 MIN_SHARE = 0.9  # of a state's photographs must be placed
 MIN_ARC = 60.0  # degrees around the object
 MIN_REGISTERED = 8
-WARN_BIAS = 0.005  # of the cameras' distance: a joint's axis would carry it
 Progress = Callable[[str], None]
 
 
@@ -97,6 +104,8 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
         facts = {"hypotheses": [], "support": check_joint_support(model), "poses": str(options.poses)}
         seen = marker_board.find_board([s.name for s in shots], work / "photos")
         model, corners = marker_board.with_corners(model, seen)
+        if (loose := loose_poses(model)) is not None:
+            progress(f"warning: {options.poses}: {loose}")
     else:
         model, corners, facts = _solved(shots, work, cache, options, progress)
     for state in STATES:
@@ -119,12 +128,6 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     facts |= _facts(model, shots, left_out, files, found, box)
     (out / "capture.json").write_text(json.dumps(facts, indent=1))
     page.write_page(out, model, box, facts)
-    bias = facts["bias"]
-    if bias["share_of_distance"] is not None and bias["share_of_distance"] > WARN_BIAS:
-        progress(
-            f"warning: the states are {100 * bias['share_of_distance']:.2f} % of the distance apart on the static "
-            "scene (capture.json)"
-        )
     return out
 
 

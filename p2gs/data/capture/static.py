@@ -97,6 +97,21 @@ def check_link(apart: float, by_board: bool, where: Path) -> None:
         raise UserError(f"{where}: {what} {seen}; {more}{ADVICE}")
 
 
+def loose_poses(model: Model) -> str | None:
+    """What a user should know of poses that somebody else solved: that their states are not joined as well as is asked
+    of a capture (``check_link``), or that they show too little to say. None where they are."""
+    apart = link(model)
+    if apart < LINKED:
+        return None
+    seen = (
+        f"both states see what stands still up to {100 * apart:.2f} % of the cameras' distance apart, more than the "
+        f"{100 * LINKED:g} % that is asked of a capture"
+        if np.isfinite(apart)
+        else "too few points are seen in both states to say whether they lie in one frame"
+    )
+    return f"{seen}; if the open state hangs on what moved, its joints are wrong"
+
+
 def check_joint_support(model: Model) -> dict:
     """Where the points lie that both states show, for poses that somebody else solved. Raises UserError where they are
     confined.
