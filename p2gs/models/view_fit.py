@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from p2gs.data.exposure import brightened, median_gain
 from p2gs.data.views import TargetImage, TrainingViews
 from p2gs.gaussians.handover import ViewCorrections
-from p2gs.models.picture_bundle import TWIST_SIGMA, adjust_pictures
+from p2gs.models.picture_bundle import adjust_pictures
 from p2gs.models.registered import correct_views
 from p2gs.models.trial import Trial, halves, trial
 from p2gs.motion.on_grey import drawing, photograph
@@ -28,6 +28,8 @@ from p2gs.ops import se3
 from p2gs.ops.ssim import l1_ssim
 from p2gs.types import Camera, GaussianTensors, View
 
+# of a camera that is looked at by itself, internal units (the object is 2): twice what structure from motion leaves
+TWIST_SIGMA = 0.003
 LOOKS = 3  # of Gauss and Newton at half a photograph; each leaves a third to a half of what is left
 
 
@@ -127,9 +129,7 @@ class ViewErrors(nn.Module):
     @torch.no_grad()
     def adjust(self, g: GaussianTensors, views: TrainingViews, size: int, backend: str) -> None:
         """All cameras at once, by bundle adjustment of the pictures of ``size`` pixels."""
-        twists = adjust_pictures(g, self.shots(views, size, g.means.device), backend)
-        self.twists.copy_(se3.log(se3.exp(self.twists.cpu()) @ se3.exp(twists)))
-        self.twists -= self.twists.mean(0)
+        self.twists.copy_(adjust_pictures(g, self.shots(views, size, g.means.device), self.twists, backend))
 
     def learn(self, rate: float) -> None:
         """One step of the camera that was looked at last, after the backward pass."""
