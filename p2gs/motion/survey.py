@@ -15,13 +15,13 @@ from p2gs.ops import se3
 
 
 def survey(
-    judge: Judge, motions: PartMotions, reach: list[float], candidates: int = 3
+    judge: Judge, motions: PartMotions, reach: list[float], candidates: int | None = None
 ) -> tuple[PartMotions, list[int]]:
     """Lay each part, shifted within its own surface, where the energy is lowest by the smallest photographs
     (``Judge.gain``); a refinement goes on from there.
 
     reach: shifts tried to both sides of the part's two long directions (internal units).  candidates: of a part's
-    shifts, how many that the surfaces like best are looked at, with labels chosen anew: those that suit a wrong place
+    shifts, how many that the surfaces like best are looked at (None: all), with labels chosen anew: those that suit a wrong place
     hold the part there.  Without surfaces (``judge.found``) labels stay, and all shifts are looked at. Returns the
     motions and which of them moved.
     """
@@ -64,7 +64,7 @@ def _shifted(judge: Judge, motions: PartMotions, k: int, reach: list[float]) -> 
 
 
 def leave_false_minima(
-    judge: Judge, motions: PartMotions, reach: list[float], candidates: int = 3
+    judge: Judge, motions: PartMotions, reach: list[float], candidates: int | None = None
 ) -> tuple[PartMotions, list[int]]:
     """Refined motions once more from where ``survey`` lays the parts, as long as that gains, and no oftener than there
     are parts and shifts: gains of several steps do not add up, so they might lead round in a circle.
