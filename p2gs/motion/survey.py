@@ -21,9 +21,9 @@ def survey(
     (``Judge.gain``); a refinement goes on from there.
 
     reach: shifts tried to both sides of the part's two long directions (internal units).  candidates: of a part's
-    shifts, how many that the surfaces like best are looked at (None: all), with labels chosen anew: those that suit a wrong place
-    hold the part there.  Without surfaces (``judge.found``) labels stay, and all shifts are looked at. Returns the
-    motions and which of them moved.
+    shifts, how many that the surfaces like best are looked at (None: all), with labels chosen anew: those that suit a
+    wrong place hold the part there.  Without surfaces (``judge.found``) labels stay, and all shifts are looked at.
+    Returns the motions and which of them moved.
     """
     glance, moved = judge.at_a_glance(judge.config.steps), []
     for k in range(len(motions)):
