@@ -169,8 +169,9 @@ def polish(
     at once.
 
     Steps look at the sides in turn and share one descent: where one state's surfaces are wrong its own optimum is wrong
-    too, and a mean of two optima with it; the sum of both losses has its minimum near the truth. A backward step of B =
-    T^-1 about a point a is the forward one about T a with its vectors turned by -R.
+    too, and a mean of two optima with it; the sum of both losses has its minimum near the truth. Each loss is taken
+    over its own mean so far (so the sum of their logarithms falls): what a state explains half as well says half as
+    much. A backward step of B = T^-1 about a point a is the forward one about T a with its vectors turned by -R.
     types: "revolute" | "prismatic" | "free" per movable part.  axes [K-1, 3]: directions that joints keep, which those
     of ``transforms`` have (NaN: free; None: all are).  ``config.steps`` are taken per side.
     Returns (transforms float64, each side's mean loss over the last tenth).
@@ -208,9 +209,8 @@ def polish(
         if side.shown is not None:
             colour = target + side.shown(index, size, shot.camera)[..., None] * (colour - target)
         loss = l1_ssim(colour, target, config.ssim_lambda)
-        loss.backward()
-        if fraction >= 0.9:
-            losses[turn].append(float(loss.detach()))
+        losses[turn].append(float(loss.detach()))
+        (loss / max(sum(losses[turn]) / len(losses[turn]), 1e-9)).backward()
         centre = se3.apply(transforms, anchors[:, None])[:, 0]
         back = transforms[:, :3, :3].transpose(1, 2) if side.back else transforms[:, :3, :3]
         limit = (
@@ -236,7 +236,8 @@ def polish(
     for k, kind in enumerate(types):
         if kind == "revolute":
             transforms[k] = se3.project_revolute(transforms[k])  # what pitch the last steps left
-    return transforms, [sum(of) / max(len(of), 1) for of in losses]
+    last = [of[-max(config.steps // 10, 1) :] for of in losses]
+    return transforms, [sum(of) / len(of) for of in last]
 
 
 def _anchors(sides, bodies, transforms: Tensor) -> tuple[Tensor, Tensor]:

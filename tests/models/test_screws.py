@@ -9,6 +9,7 @@ from p2gs.gaussians.pose import carry, with_static
 from p2gs.motion.part_pull import tangent_gradient
 from p2gs.motion.screw_polish import PolishConfig, Side, allowed_step, apply_step, polish
 from p2gs.ops import se3, so3
+from p2gs.ops.ssim import l1_ssim
 
 
 def test_tangent_gradient_is_the_derivative():
@@ -86,3 +87,31 @@ def test_polish_recovers_a_known_motion(kind, ways):
     at = [(T[:3, :3] @ centre + T[:3, 3]) for T in (found[0], truth)]
     assert float((at[0] - at[1]).norm()) < 0.003
     assert max(losses) < 0.05
+
+
+def test_a_sides_errors_count_over_their_own_scale(monkeypatch):
+    """Photographs of which one side's loss is eight times as large, whatever the reason, give the same motion."""
+    g, labels = textured_panels()
+    sides = [
+        Side(g, labels, TrainingViews(photographs(g, labels, slide(), 1), [64])),
+        Side(
+            carry(g, labels, with_static(hinge()[None])),
+            labels,
+            TrainingViews(photographs(g, labels, torch.eye(4).double(), 0), [64]),
+            back=True,
+        ),
+    ]
+    config, calls = PolishConfig(steps=12, levels=[64], level_starts=[0.0], rate=1e-2, min_margin=0.0), []
+
+    def ask(factor):
+        def loss(*given):
+            calls.append(1)
+            return l1_ssim(*given) * (factor if len(calls) % 2 else 1)
+
+        calls.clear()
+        monkeypatch.setattr("p2gs.motion.screw_polish.l1_ssim", loss)
+        return polish(sides, slide()[None], ["prismatic"], config, seed=0)
+
+    (found, losses), (other, more) = ask(1.0), ask(8.0)
+    assert torch.allclose(found, other, atol=1e-6) and not torch.allclose(found, slide()[None], atol=1e-3)
+    assert more == pytest.approx([8 * losses[0], losses[1]], rel=1e-3)
