@@ -23,7 +23,7 @@ from torch import Tensor
 
 from p2gs.data.views import TargetImage
 from p2gs.motion.picture_steps import SHIFT, TWIST, PictureSteps, picture_steps
-from p2gs.ops import so3
+from p2gs.ops import se3, so3
 from p2gs.types import Camera, GaussianTensors
 
 SHIFT_SIGMA = 0.002  # of surfaces, internal units (the object is 2): a quarter of a pixel of 400
@@ -47,8 +47,7 @@ def adjust_pictures(g: GaussianTensors, shots: Iterable[TargetImage], known: Ten
 def _own_errors(camera: Camera) -> Tensor:
     """[6, 6]: a small twist as the camera's own turn and the way that its centre goes, both over nothing but radians:
     the way is divided by the camera's distance from the origin."""
-    V = camera.viewmat.double().cpu()
-    centre = -V[:3, :3].T @ V[:3, 3]
+    centre = se3.inverse(camera.viewmat.double().cpu())[:3, 3]
     out = torch.eye(6, dtype=torch.float64)
     # V exp(twist) has its centre at c - (w x c + v)
     out[3:, :3], out[3:, 3:] = so3.skew(centre), -torch.eye(3).double()
@@ -108,6 +107,6 @@ def _variances(say: np.ndarray, a: np.ndarray) -> tuple[float, float]:
         variance = np.exp(x[0]) + np.exp(-x[1]) / a
         return float((np.log(variance) + say**2 / variance).sum())
 
-    begin = [np.log(np.median(say**2) + 1e-30), 0.0]
-    s, k = np.exp(minimize(unlikely, begin, method="Nelder-Mead", options={"maxiter": 1000}).x)
+    begin = [np.log(np.median(say**2) + np.finfo(float).tiny), 0.0]
+    s, k = np.exp(minimize(unlikely, begin, method="Nelder-Mead").x)
     return float(s), float(k)

@@ -156,8 +156,10 @@ def test_survey_chooses_labels_anew_for_what_surfaces_like_best(monkeypatch):
         new = torch.where(arrives, labels, 0)
         return replace(motions, labels=[new, labels])
 
+    def liked(found, transforms, types):
+        return float((transforms[0] - truth)[:3, 3].norm())
+
     monkeypatch.setattr("p2gs.motion.survey.relabelled", chosen)
-    liked = lambda found, T, types: float((T[0] - truth)[:3, 3].norm())  # noqa: E731
     monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", liked)
     margins = [torch.ones(len(labels))] * 2
     motions = chosen(None, states, PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], margins))

@@ -118,7 +118,7 @@ def test_a_cameras_own_errors_are_its_turn_and_its_centres_way():
 @pytest.mark.parametrize("s, k", [(0.002, 1.0), (0.002, 0.01), (0.0005, 0.1)])
 def test_how_far_off_cameras_are_and_what_a_pixel_counts_is_found(s, k):
     """Pixels that say a turn and a step aside apart only roughly, with errors of their own: both variances come out,
-    and cameras three times nearer than by pixels alone (a fifth where pixels are sure)."""
+    and cameras come out two and a half times nearer than by pixels alone, twenty times where pixels count little."""
     rng, count = torch.Generator().manual_seed(0), 60
     ways = torch.stack(looking_in(count))
     true = torch.linalg.solve(ways, s * torch.randn(count, 6, 1, generator=rng, dtype=torch.float64))[..., 0]
@@ -136,7 +136,7 @@ def test_how_far_off_cameras_are_and_what_a_pixel_counts_is_found(s, k):
     told = _most_likely(A, b, known, ways)
     own = [(ways @ (x - true + true.mean(0))[..., None]).norm() for x in (told, found)]
     assert told.mean(0).abs().max() < 1e-12
-    assert float(own[0]) < 0.9 * float(own[1]), own
+    assert float(own[0]) < (0.4 if k == 1 else 0.05) * float(own[1]), own
     back = torch.block_diag(*torch.linalg.inv(ways))
     a, axes = torch.linalg.eigh(back.T @ A @ back)
     say = axes.T @ (ways @ found[..., None]).flatten()

@@ -20,7 +20,7 @@ from p2gs.data.capture.auto_masks import auto_masks
 from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
 from p2gs.data.capture.hypotheses import Hypothesis, State
-from p2gs.data.capture.joint import is_end, join, state_bias, states_of
+from p2gs.data.capture.joint import is_end, join, state_bias
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred, lens_groups
 from p2gs.data.capture.segmenters import segmenter_of
@@ -290,7 +290,6 @@ def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, bo
     images += [{"state": n.split("/")[0], "source": s, "file": None, "reason": why} for n, (s, why) in left_out.items()]
     bias, (_, distance) = state_bias(model), model.centre()
     known = bool(np.isfinite(bias.shift))
-    seen = states_of(model)
     return {
         "format": FORMAT,
         "images": images,
@@ -300,7 +299,7 @@ def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, bo
             "points": bias.points,
             "share_of_distance": bias.shift / distance if known else None,
         },
-        "share_of_points_in_both_states": float(seen.all(1).mean()) if len(seen) else 0.0,
+        "share_of_points_in_both_states": bias.share,
         "lenses": {str(k): {**asdict(lens), "params": lens.params.tolist()} for k, lens in model.lenses.items()},
         "gains": {
             files[p.name]: np.exp(found[k]).round(4).tolist() for k, p in model.photos.items() if p.name in files

@@ -83,11 +83,16 @@ def link(model: Model) -> float:
     return float((bias.shift + bias.shift_sd) / distance + AROUND * np.radians(bias.turn + bias.turn_sd))
 
 
+def _told(apart: float) -> str:
+    """``link`` in words."""
+    return f"up to {100 * apart:.2f} % of the cameras' distance apart"
+
+
 def check_link(apart: float, by_board: bool, where: Path) -> None:
     """Raises UserError where joined states do not see what stands still at one place (``link``), or do not see enough
     of it to say.  by_board: the marker board joins them."""
     if not apart < LINKED:
-        seen = f"up to {100 * apart:.2f} % of the cameras' distance apart" if np.isfinite(apart) else "too rarely"
+        seen = _told(apart) if np.isfinite(apart) else "too rarely"
         what = (
             "little but the marker board is seen to stand still in both states, and they see it"
             if by_board
@@ -104,8 +109,7 @@ def loose_poses(model: Model) -> str | None:
     if apart < LINKED:
         return None
     seen = (
-        f"both states see what stands still up to {100 * apart:.2f} % of the cameras' distance apart, more than the "
-        f"{100 * LINKED:g} % that is asked of a capture"
+        f"both states see what stands still {_told(apart)}, more than the {100 * LINKED:g} % that is asked of a capture"
         if np.isfinite(apart)
         else "too few points are seen in both states to say whether they lie in one frame"
     )
