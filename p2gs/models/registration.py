@@ -63,6 +63,7 @@ def align_states(
     box: Tensor,
     config: RegistrationConfig,
     backend: str = "auto",
+    device: torch.device | str = "cpu",
     report=None,
 ) -> Registration:
     """The end's motion into the start's frame and its gain, each none where it is not wanted or held-out photographs
@@ -84,7 +85,7 @@ def align_states(
     found = fit_surfaces(surfels[1], surfels[0], config.reach * diagonal)
     T = found.transform if config.motion == "auto" else still
     tolerance = 4 * (surfels[0].noise ** 2 + surfels[1].noise ** 2) ** 0.5 + 2e-3 * diagonal
-    pair = Pair(states[0].gaussians, states[1].gaussians, views, tolerance, backend)
+    pair = Pair(*(s.gaussians.to(device) for s in states), views, tolerance, backend)
     held = [held_out(len(views[s])) for s in (1, 0)]
     fitted, judged = [h[0] for h in held], [h[1] for h in held]
     gain = pair.end_gain(T, fitted[0], config.levels[0]) if config.gain == "auto" else dark
@@ -211,9 +212,8 @@ class RegistrationStage(Stage):
     def compute(cls, run: RunContext, section, *, states: list[StateGaussians]) -> Registration:
         say = partial(run.log, cls.phase_name)
         assert run.scene.box is not None  # every scene that is trained on has one
-        return align_states(
-            states, evidence_of(run, states), run.views, run.scene.box, section.config, run.rasterizer, say
-        )
+        options = {"backend": run.rasterizer, "device": run.device, "report": say}
+        return align_states(states, evidence_of(run, states), run.views, run.scene.box, section.config, **options)
 
     @classmethod
     def hand_on(cls, run: RunContext, value: Registration, *, states: list[StateGaussians]) -> dict:

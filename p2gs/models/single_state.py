@@ -228,12 +228,13 @@ class SingleStatePhase(StatePhase):
         first, *later = [round(share * self.total_steps) for share in (config.at, *config.measured)]
         bundled = [round(share * self.total_steps) for share in config.bundled]
         if step == first and config.cameras == "auto":
-            self.decide(1, "cameras", try_cameras(g, views, config.levels[0], self.rasterizer))
+            self.decide(1, "cameras", try_cameras(g, views, self.level(step), self.rasterizer))
         if step in later and config.gains == "auto":
             if not bool(errors.decided[0]):
-                self.decide(0, "gains", try_gains(g, views, errors, config, self.rasterizer))
+                self.decide(0, "gains", try_gains(g, views, errors, self.level(step), self.rasterizer))
             if bool(errors.on[0]):
-                errors.log_gains += measure_gains(g, views, errors, config.levels[0], self.rasterizer)
+                found = measure_gains(g, views, errors, self.level(step), self.rasterizer)
+                errors.log_gains += found.to(errors.log_gains)
         if step in bundled and config.masks == "auto" and (bool(errors.on[2]) or not bool(errors.decided[2])):
             self.measure_masks(self.level(step))
         known = torch.cat([errors.log_gains, errors.growths[:, None]], 1).cpu()
@@ -251,7 +252,7 @@ class SingleStatePhase(StatePhase):
         if not bool(errors.decided[2]):
             self.decide(2, "masks", try_masks(edges))
         if bool(errors.on[2]):
-            errors.growths += growths_of(edges)
+            errors.growths += growths_of(edges).to(errors.growths)
 
     def decide(self, which: int, name: str, found: Trial) -> None:
         """Switch gains (0), cameras (1) or masks (2) on where held-out halves say so, and tell."""

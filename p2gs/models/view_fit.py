@@ -37,14 +37,14 @@ LOOKS = 3  # of Gauss and Newton at half a photograph; each leaves a third to a 
 class ViewFitConfig:
     """What may be wrong with single photographs.
 
-    gains, cameras, masks: "auto" (photographs decide, once) or "never".  at: share of the phase that is done when they
-    decide on cameras.  measured: shares at which gains are measured; at the first, with the cameras put right, they
-    decide on them.  bundled: shares at which masks are measured, the first time to decide on them, and then all cameras
+    gains, cameras, masks: "auto" (photographs decide, once) or "never". at: share of the phase that is done when they
+    decide on cameras. measured: shares at which gains are measured; at the first, with the cameras put right, they
+    decide on them. bundled: shares at which masks are measured, the first time to decide on them, and then all cameras
     are put right at once, by all pixels of the size that is trained on (``picture_bundle``); between them each follows
-    the model by its gradient.  levels: the size of the photographs that decide, pixels.  rate: of the cameras' Adam in
-    internal units, falling to a hundredth.  least: share by which the other halves' errors must fall (of masks: clean
-    scenes at most 0.8 %, masks off by up to two pixels 11.8 to 16.5 %); least_cameras: the same of cameras, which
-    explain a coarse model's errors too: of clean scenes 3 to 4.3 %, of cameras off by a tenth of a degree 17.6 to 34 %.
+    the model by its gradient. rate: of the cameras' Adam in internal units, falling to a hundredth. least: share by
+    which the other halves' errors must fall (of masks: clean scenes at most 0.8 %, masks off by up to two pixels 11.8
+    to 16.5 %); least_cameras: the same of cameras, which explain a coarse model's errors too: of clean scenes 3 to 4.3
+    %, of cameras off by a tenth of a degree 17.6 to 34 %.
     """
 
     gains: Literal["auto", "never"] = "never"
@@ -53,7 +53,6 @@ class ViewFitConfig:
     at: float = 0.12
     measured: list[float] = field(default_factory=lambda: [0.2, 0.5])
     bundled: list[float] = field(default_factory=lambda: [0.2, 0.4, 0.6, 0.8])
-    levels: list[int] = field(default_factory=lambda: [200])
     rate: float = 1e-3
     least: float = 0.02
     least_cameras: float = 0.08
@@ -164,13 +163,11 @@ def measure_gains(g: GaussianTensors, views: TrainingViews, errors: ViewErrors, 
 
 
 @torch.no_grad()
-def try_gains(
-    g: GaussianTensors, views: TrainingViews, errors: ViewErrors, config: ViewFitConfig, backend: str
-) -> Trial:
+def try_gains(g: GaussianTensors, views: TrainingViews, errors: ViewErrors, size: int, backend: str) -> Trial:
     """Errors of half photographs without and with the gain that their other half tells, as it differs from the
     photographs' mean.  errors: what is known of the cameras."""
     drawn = []
-    for shot in errors.shots(views, config.levels[0], g.means.device):
+    for shot in errors.shots(views, size, g.means.device):
         out = drawing(g, shot.camera, backend)
         inside = (shot.alpha > 0.99) & (out.alpha > 0.99)
         both = [half.to(g.means) for half in halves(*inside.shape)]
@@ -184,8 +181,8 @@ def try_gains(
     for k, (photo, colour, inside, both, gains) in enumerate(drawn):
         for half, gain in zip(both, gains[::-1], strict=True):
             seen = inside & (half > 0)
-            off[0, k] += (photo[seen] - colour[seen]).abs().mean()
-            off[1, k] += (photo[seen] - brightened(colour[seen], gain - mean)).abs().mean()
+            off[0, k] += (photo[seen] - colour[seen]).abs().mean().cpu()
+            off[1, k] += (photo[seen] - brightened(colour[seen], gain - mean)).abs().mean().cpu()
     return trial(*off)
 
 

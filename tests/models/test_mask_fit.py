@@ -85,7 +85,7 @@ def test_masks_that_need_nothing_or_would_vanish_stay():
 def test_a_phase_decides_on_masks():
     g, right, wrong = scene()
     for photos, off in ((wrong, True), (right, False)):
-        forgive = ViewFitConfig(masks="auto", levels=[SIZE])
+        forgive = ViewFitConfig(masks="auto")
         config = SingleStateConfig(steps=10, levels=[SIZE], level_starts=[0.0], initial_gaussians=50, forgive=forgive)
         box = torch.tensor([[-0.6, -0.2, -0.6], [0.6, 0.9, 0.6]])
         whole = TrainingViews(photos, [SIZE], crop=False)

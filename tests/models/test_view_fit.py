@@ -22,7 +22,7 @@ from p2gs.ops.ssim import l1_ssim
 from p2gs.types import TwoStateScene
 
 SIZE = 64
-CONFIG = ViewFitConfig(levels=[SIZE])
+CONFIG = ViewFitConfig()
 
 
 def scene(count: int = 8):
@@ -56,8 +56,8 @@ def test_gains_are_measured():
     known = ViewErrors(len(views))
     found = measure_gains(g, pyramid(shots), known, SIZE, "auto")
     assert (found - gains).abs().max() < 0.015 and found.mean(0).abs().max() < 1e-12
-    assert try_gains(g, pyramid(shots), known, CONFIG, "auto").passed(CONFIG.least)
-    assert not try_gains(g, pyramid(views), known, CONFIG, "auto").passed(CONFIG.least)
+    assert try_gains(g, pyramid(shots), known, SIZE, "auto").passed(CONFIG.least)
+    assert not try_gains(g, pyramid(views), known, SIZE, "auto").passed(CONFIG.least)
 
 
 def test_only_real_errors_of_cameras_are_seen():
@@ -130,7 +130,7 @@ def test_a_phase_decides():
     g, views = scene()
     shots, gains = exposed(views, 0.06)
     for photos, wrong in ((shots, True), (views, False)):
-        forgive = ViewFitConfig("auto", "never", levels=[SIZE])
+        forgive = ViewFitConfig("auto", "never")
         config = SingleStateConfig(steps=10, levels=[SIZE], level_starts=[0.0], initial_gaussians=50, forgive=forgive)
         box = torch.tensor([[-0.6, -0.2, -0.6], [0.6, 0.9, 0.6]])
         phase = SingleStatePhase(config, {}, TwoStateScene("panels", tuple(photos), box=box), 0, pyramid(photos))

@@ -86,7 +86,7 @@ def backward(
     for name in outputs:
         image = getattr(out, name)
         if image is not None:
-            loss = loss + (image * torch.randn(image.shape, generator=g, dtype=torch.float64).to(image.dtype)).sum()
+            loss = loss + (image * torch.randn(image.shape, generator=g, dtype=torch.float64).to(image)).sum()
     loss.backward()
     return {k: torch.zeros_like(t) if t.grad is None else t.grad for k, t in leaves.items()}
 
