@@ -18,7 +18,7 @@ from p2gs.gaussians.pose import part_transform
 from p2gs.ops.palette import part_colour, part_colours
 from p2gs.ops.sh import dc_to_rgb, rgb_to_dc
 from p2gs.render import rasterize
-from p2gs.render.base import split_backend
+from p2gs.render.base import device_of
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors, Joint, RenderOutput
 
 RASTERIZER: ContextVar[str] = ContextVar("rasterizer", default="auto")
@@ -62,9 +62,7 @@ def draw(
     GPU.
     """
     backend = backend or RASTERIZER.get()
-    device = (
-        torch.device("cuda") if split_backend(backend)[0] == "gsplat" and torch.cuda.is_available() else g.means.device
-    )
+    device = device_of(backend, g.means)
     colour = torch.as_tensor(background, dtype=torch.float32, device=device).expand(3).contiguous()
     if device != g.means.device:
         g = g.to(device)

@@ -266,6 +266,6 @@ class SingleStatePhase(StatePhase):
         g, views, corrections = self.splats.tensors().clone(), self.views[self.state], self.errors.handed_over()
         if self.config.min_visible > 0 and len(g):
             cameras = [views.camera(i, views.levels.index(self.config.levels[-1])) for i in range(len(views))]
-            g = g[visible_share(g, cameras, self.rasterizer, g.means.device) >= self.config.min_visible]
+            g = g[visible_share(g, cameras, self.rasterizer) >= self.config.min_visible]
         check_gaussians(self.phase_name, len(g), len(self.splats))
         return StateGaussians(self.state, g, corrections)

@@ -41,6 +41,12 @@ def split_backend(backend: str) -> tuple[str, Pixels]:
     return name, PIXELS[pixels or "classic"]
 
 
+def device_of(backend: str, tensor: Tensor) -> torch.device:
+    """Where a backend draws what ``tensor`` is of: gsplat on the GPU, if there is one, others where it is."""
+    on_gpu = split_backend(backend)[0] == "gsplat" and torch.cuda.is_available()
+    return torch.device("cuda") if on_gpu else tensor.device
+
+
 def with_pixels(backend: str, pixels: str) -> str:
     """The same backend with the pixels named."""
     return f"{backend.partition(':')[0]}:{pixels}"

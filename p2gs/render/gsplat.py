@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 
 from p2gs.ops.sh import evaluate
 from p2gs.render.base import ALPHA_MIN, FAR, RASTERIZERS, RenderInputs
+from p2gs.render.torch_ref import rasterize_torch
 from p2gs.types import RenderOutput, UserError
 
 try:
@@ -61,6 +62,8 @@ def rasterize_gsplat(a: RenderInputs) -> RenderOutput:
 def through_gsplat(a: RenderInputs) -> RenderOutput:
     """The mapping onto gsplat's arguments and back, whatever the device."""
     device, dtype = a.means.device, torch.float32
+    if not len(a.means):  # gsplat 1.5.3 divides by their number
+        return rasterize_torch(a)
     viewmat, K = a.viewmat.to(device, dtype), a.K.detach().to(device, dtype)
     R, t = viewmat[:3, :3], viewmat[:3, 3]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from p2gs.ops import so3
 from p2gs.render import rasterize
-from p2gs.render.base import PIXELS, Pixels, split_backend
+from p2gs.render.base import PIXELS, Pixels, device_of, split_backend
 from p2gs.types import Camera, GaussianTensors
 
 
@@ -38,14 +38,13 @@ def footprint(g: GaussianTensors, camera: Camera, pixels: Pixels = PIXELS["class
     return torch.where(p[:, 2] > 0.01, area, torch.zeros_like(area))
 
 
-def visible_share(
-    g: GaussianTensors, cameras: list[Camera], backend: str = "auto", device: torch.device | str = "cpu"
-) -> Tensor:
+def visible_share(g: GaussianTensors, cameras: list[Camera], backend: str = "auto") -> Tensor:
     """Greatest share of its footprint that any camera sees of each Gaussian (1: nothing in front; 0: hidden
     everywhere), [N] on the CPU.
 
     A Gaussian's weight in an image, summed over pixels, is the derivative of a feature channel's sum by its feature.
     """
+    device = device_of(backend, g.means)  # a phase that is done has its Gaussians on the CPU
     g = g.detach().to(device)
     best = torch.zeros(len(g), device=device)
     features = torch.zeros(len(g), 1, device=device, requires_grad=True)
