@@ -19,6 +19,8 @@ from p2gs.data.images import premultiply, resize_area, resize_nearest, to_uint8
 from p2gs.ops.pixels import compose
 from p2gs.types import Camera, View
 
+MARGIN = 0.03  # beside the mask, of the long edge: a dozen pixels of background at 400
+
 
 @lru_cache(maxsize=8)
 def _permutation(seed: int, epoch: int, n: int) -> np.ndarray:
@@ -84,7 +86,7 @@ class TrainingViews:
         self,
         views: Sequence[View],
         levels: Sequence[int] = (100, 200, 400),
-        margin: float = 0.03,
+        margin: float = MARGIN,
         align: int = 16,
         crop: bool = True,
     ):

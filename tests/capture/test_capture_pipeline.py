@@ -90,6 +90,25 @@ def test_poses_and_masks_become_a_scene(capture, tmp_path, capsys):
     assert "photos_start: unchanged" in capsys.readouterr().out
 
 
+def test_pictures_are_windows_about_the_object(capture, tmp_path):
+    out = tmp_path / "scene"
+    assert command(capture, out, "--masks", str(capture / "masks")) == 0
+    model = read_model(out / "sparse/0")
+    assert model.errors()[2].max() < 0.5  # the windows' cameras see the points where the photographs saw them
+    whole = next(iter(read_model(capture / "sparse").lenses.values()))
+    for photo in model.photos.values():
+        lens, alpha = model.lenses[photo.lens], cv2.imread(str(out / photo.name), cv2.IMREAD_UNCHANGED)[..., 3]
+        assert alpha.shape == (lens.height, lens.width) and len(photo.xy) > 0
+        rows, cols = np.nonzero(alpha.any(1))[0], np.nonzero(alpha.any(0))[0]
+        beside = [rows[0], cols[0], lens.height - 1 - rows[-1], lens.width - 1 - cols[-1]]
+        assert min(beside) >= 0.02 * max(alpha.shape)
+        tight = [min(beside[0], beside[2]), min(beside[1], beside[3])]
+        assert max(tight) <= 0.05 * max(alpha.shape)  # on one side at least of each direction
+        middle = lens.K[:2, 2] / [lens.width, lens.height]
+        assert np.abs(middle - 0.5).max() < 0.02
+        assert lens.width < whole.width and lens.height < whole.height
+
+
 def test_a_folder_of_something_else_is_not_written_into(capture, tmp_path, capsys):
     (tmp_path / "mine.txt").write_text("x")
     assert command(capture, tmp_path, "--masks", str(capture / "masks")) == 2
