@@ -53,7 +53,7 @@ class Evaluation(Callback):
 def current_joints(phase, similarity: Similarity, prismatic_below: float) -> Optional[list[Joint]]:
     """The joints a phase has learned so far, in input units; None for a phase that learns none."""
     from p2gs.gaussians.handover import Articulation
-    from p2gs.models.finish import make_joint, name_types
+    from p2gs.models.joint_of import make_joint, name_types
 
     learned = phase.hand_over() if hasattr(phase, "screws") else None
     if not isinstance(learned, Articulation):

@@ -9,28 +9,22 @@ from typing import Any, Literal, Sequence
 import torch
 from torch import Tensor
 
-from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
-from p2gs.gaussians.pose import carry, with_static
 from p2gs.losses.base import Loss
+from p2gs.models.joint_of import constrain, make_joint, name_types
 from p2gs.models.tune import TuneConfig, tune
+from p2gs.models.twin_labels import clean_labels, settle_labels, state_labels, surviving_slots
 from p2gs.motion.directions import shared_axes
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
 from p2gs.motion.refine_motions import Judge, single_ways
 from p2gs.motion.screw_polish import PolishConfig, photometric_cost
 from p2gs.motion.survey import leave_false_minima
-from p2gs.ops import se3, so3
-from p2gs.ops.knn import knn
+from p2gs.ops import se3
 from p2gs.parts.askew import keep_shared, lay_axes
-from p2gs.parts.islands import settle_twin_islands
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import drop_needless, own_shares, settle_types
-from p2gs.surface.contents import in_trays
-from p2gs.types import ArticulatedObject, GaussianTensors, Joint, Part, Similarity
-from p2gs.visibility.depth_stack import DepthStack
-
-UNKNOWN = 4.0  # a state's Gaussian farther than this from the twin, in the median's units, is none of the twin's
+from p2gs.types import ArticulatedObject, GaussianTensors, Part, Similarity
 
 
 @dataclass
@@ -104,80 +98,6 @@ class FinishRecord:
     laid: list[dict] = field(default_factory=list)
 
 
-def majority(labels: Tensor, neighbours: Tensor, weights: Tensor, parts: int) -> tuple[Tensor, Tensor]:
-    """Weighted majority of labels [M] over neighbours [N, k] (indices into labels), weights [N, k]: label [N] and its
-    share [N]."""
-    votes = torch.zeros(len(neighbours), parts)
-    votes.scatter_add_(1, labels[neighbours], weights)
-    share, label = votes.max(1)
-    return label, share / votes.sum(1).clamp_min(1e-9)
-
-
-def clean_labels(g: GaussianTensors, labels: Tensor, parts: int, k: int) -> Tensor:
-    """Labels [N] by the opacity-weighted majority of the k nearest Gaussians, each counting itself twice."""
-    if k <= 0 or len(labels) <= k:
-        return labels
-    _, index = knn(g.means, None, k, True)
-    own = torch.arange(len(labels))[:, None]
-    index = torch.cat([own, own, index], dim=1)
-    return majority(labels, index, torch.sigmoid(g.opacity_logits)[index], parts)[0]
-
-
-def surviving_slots(learned: Articulation, labels: Tensor, config: FinishConfig) -> list[int]:
-    """Movable slots with mass and motion, as slot numbers; labels [N]."""
-    solid = torch.sigmoid(learned.gaussians.opacity_logits) > 0.5
-    alive = []
-    for k in range(1, len(learned.types) + 1):
-        rows = solid & (labels == k)
-        mass = float(rows.sum()) / max(float(solid.sum()), 1.0)
-        if mass < config.min_mass:
-            continue
-        points = learned.gaussians.means[rows].double()
-        at = [
-            se3.apply(se3.screw_at(learned.transforms[k - 1], s - learned.canonical_time), points) for s in (0.0, 1.0)
-        ]
-        if float((at[1] - at[0]).norm(dim=1).mean()) >= config.min_motion:
-            alive.append(k)
-    return alive
-
-
-def state_labels(
-    learned: Articulation, labels: Tensor, state: StateGaussians, transforms: Tensor, k: int = 6
-) -> tuple[Tensor, Tensor]:
-    """Labels [M] of a single-state reconstruction by the twin posed in that state; margin = how far the majority
-    exceeds the rest, 0..1, or -1 for what the twin has nothing near of (lids that gave way to walls): the polish leaves
-    that out."""
-    posed = carry(
-        learned.gaussians, labels, se3.screw_at(with_static(transforms), state.state - learned.canonical_time)
-    )
-    solid = (torch.sigmoid(posed.opacity_logits) > 0.1).nonzero().squeeze(1)
-    distance, index = knn(posed.means[solid], state.gaussians.means, k, False)
-    spacing = distance[:, 0].median().clamp_min(1e-4)
-    weights = torch.exp(-(distance / (2 * spacing)).square()) + 1e-9
-    label, share = majority(labels[solid], index, weights, len(transforms) + 1)
-    margin = torch.where(distance[:, 0] > UNKNOWN * spacing, -1.0, 2 * share - 1)
-    return label, margin
-
-
-def name_types(types: list[str], transforms: Tensor, below: float) -> list[str]:
-    """Give every "free" motion a joint type by its angle; transforms [K, 4, 4]."""
-    angle = so3.rotation_angle(transforms[:, :3, :3]) * 57.29578 if len(transforms) else []
-    return [
-        ("prismatic" if float(a) < below else "revolute") if t == "free" else t
-        for t, a in zip(types, angle, strict=True)
-    ]
-
-
-def constrain(kind: str, T: Tensor, centre: Tensor) -> Tensor:
-    """The nearest motion [4, 4] of a joint type: a slide carries ``centre`` [3] where T does, a turn loses its
-    pitch."""
-    if kind == "prismatic":
-        out = torch.eye(4, dtype=T.dtype)
-        out[:3, 3] = T[:3, :3] @ centre + T[:3, 3] - centre
-        return out
-    return se3.project_revolute(T)
-
-
 def finish(
     learned: Articulation,
     states: list[StateGaussians],
@@ -200,56 +120,37 @@ def finish(
     backend: draws the states, twin_backend: the twin in ``tune`` (None: the same).  A part's confidence is
     ``JointEvidence.confidence`` of its joint.
     """
-    labels = clean_labels(learned.gaussians, learned.part_ids, len(learned.types) + 1, config.clean_neighbours)
-    alive = surviving_slots(learned, labels, config)
-    notes = [
-        f"slot {k} of {len(learned.types)} vanished: no Gaussians of its own, or no motion"
-        for k in range(1, len(learned.types) + 1)
-        if k not in alive
-    ]
-    remap = torch.zeros(len(learned.types) + 1, dtype=torch.int64)
-    for new, old in enumerate(alive):
-        remap[old] = new + 1
-    labels = remap[labels]
+    labels, alive, notes = _slots(learned, config)
     keep = torch.tensor([k - 1 for k in alive], dtype=torch.int64)
-    transforms = learned.transforms[keep]
-    types = name_types([learned.types[k - 1] for k in alive], transforms, config.prismatic_below)
+    types, transforms = _typed(learned, labels, keep, config.prismatic_below)
     time = learned.canonical_time
     axes = torch.full((len(types), 3), torch.nan).double()
     if discovered is not None and len(discovered) == len(learned.types):
         axes = shared_axes(discovered.transforms, discovered.types)[keep]
-    for k, kind in enumerate(types):
-        rows = labels == k + 1
-        start = se3.apply(se3.screw_at(transforms[k], -time), learned.gaussians.means[rows].double())
-        transforms[k] = constrain(kind, transforms[k], start.mean(0))
     options: dict[str, Any] = {"backend": backend, "device": device}
     level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
     twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
-    labels, moved = settle_labels(twin, views, stacks, config, twin_backend or backend)
+    limits = {"islands": config.islands, "trays": config.trays, "tau": config.polish.free_static or 0.02}
+    labels, moved = settle_labels(twin, views, stacks, **limits, backend=twin_backend or backend)
     found = [state_labels(learned, labels, s, transforms) for s in states]
     record = FinishRecord(
         [f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive, contents=moved
     )
     options["seed"] = seed
     if len(types):
-        motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         judge = Judge(None, states, views, config.polish, stacks, **options)
-        refined = judge.no_worse(motions, judge.refine(motions)) if config.polish.steps > 0 else motions
-        refined, _ = leave_false_minima(judge, refined, config.survey)
-        if config.polish.steps > 0:
-            refined = settle_types(judge, refined, config.prismatic_below, config.freedom_penalty)
-        refined, record.laid = lay_axes(judge, refined, config.askew)
-        refined = keep_shared(judge, refined, axes)
+        motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
+        refined, record.laid = _refined(judge, motions, axes, config)
         refined, labels, gone = drop_needless(judge, refined, labels, config.part_penalty)
         for part in gone:
             notes.append(f"slot {alive.pop(part['part'])} of {len(learned.types)} vanished: {part['why']}")
             transforms = torch.cat([transforms[: part["part"]], transforms[part["part"] + 1 :]])
         types, record.labels, record.before = refined.types, refined.labels, transforms
         record.after = transforms = refined.transforms
-    if len(types):
-        record.polish = single_ways(states, refined, views, config.polish, stacks, **options)
-        measure(record, judge, refined, level)
+        if len(types):
+            record.polish = single_ways(states, refined, views, config.polish, stacks, **options)
+            measure(record, judge, refined, level)
     options["backend"] = twin_backend or backend
     gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
     twin = assemble(gaussians, labels, types, transforms, time, similarity, [e.confidence for e in record.evidence])
@@ -258,35 +159,40 @@ def finish(
     return twin, notes, record
 
 
-def settle_labels(
-    twin: ArticulatedObject,
-    views: dict[int, TrainingViews],
-    stacks: list[DepthStack],
-    config: FinishConfig,
-    backend: str,
-) -> tuple[Tensor, int]:
-    """Labels [N] without islands, what is in drawers with these; and to how many Gaussians the latter happened.
+def _slots(learned: Articulation, config: FinishConfig) -> tuple[Tensor, list[int], list[str]]:
+    """Labels [N] counted by the slots that stay, these slots' numbers, and a line for each that vanishes."""
+    slots = len(learned.types)
+    labels = clean_labels(learned.gaussians, learned.part_ids, slots + 1, config.clean_neighbours)
+    alive = surviving_slots(learned, labels, config.min_mass, config.min_motion)
+    remap = torch.zeros(slots + 1, dtype=torch.int64)
+    for new, old in enumerate(alive):
+        remap[old] = new + 1
+    why = "vanished: no Gaussians of its own, or no motion"
+    return remap[labels], alive, [f"slot {k} of {slots} {why}" for k in range(1, slots + 1) if k not in alive]
 
-    twin: as learned, internal coordinates; views: photographs by state; stacks: rendered depth of both states; backend:
-    draws the twin for what is in drawers.
-    """
-    fuller = round(twin.canonical_time)  # the state that shows more
-    T = torch.stack(
-        [torch.eye(4, dtype=torch.float64)] + [p.joint.transform for p in twin.parts[1:] if p.joint is not None]
-    )
-    away, tau = se3.inverse(T) if fuller else T, config.polish.free_static or 0.02
 
-    def without_islands(labels: Tensor, held: Tensor | None = None) -> Tensor:
-        posed = carry(twin.gaussians, labels, se3.screw_at(T, fuller - twin.canonical_time))
-        return settle_twin_islands(posed, labels, config.islands, away, stacks[1 - fuller], tau, held)
+def _typed(learned: Articulation, labels: Tensor, keep: Tensor, below: float) -> tuple[list[str], Tensor]:
+    """Joint types of the learned motions ``keep`` and the nearest motions [K, 4, 4] of these types; labels [N] by the
+    order of ``keep``."""
+    transforms = learned.transforms[keep]
+    types = name_types([learned.types[k] for k in keep], transforms, below)
+    for k, kind in enumerate(types):
+        points = learned.gaussians.means[labels == k + 1].double()
+        start = se3.apply(se3.screw_at(transforms[k], -learned.canonical_time), points)
+        transforms[k] = constrain(kind, transforms[k], start.mean(0))
+    return types, transforms
 
-    labels = without_islands(twin.part_ids)
-    if config.trays <= 0:
-        return labels, 0
-    cameras = [(s, views[s].camera(i, -1)) for s in (0, 1) for i in views[s].spread(config.trays)]
-    settled, held = in_trays(replace(twin, part_ids=labels), cameras, backend)
-    count = int((settled != labels).sum())
-    return without_islands(settled, held) if count else labels, count
+
+def _refined(judge: Judge, motions: PartMotions, axes: Tensor, config: FinishConfig) -> tuple[PartMotions, list[dict]]:
+    """The motions as photographs have them, and the axes that were tried along the object's directions; axes [K, 3]:
+    directions that slides share (NaN: none)."""
+    polished = config.polish.steps > 0
+    refined = judge.no_worse(motions, judge.refine(motions)) if polished else motions
+    refined, _ = leave_false_minima(judge, refined, config.survey)
+    if polished:
+        refined = settle_types(judge, refined, config.prismatic_below, config.freedom_penalty)
+    refined, laid = lay_axes(judge, refined, config.askew)
+    return keep_shared(judge, refined, axes), laid
 
 
 def assemble(
@@ -324,17 +230,3 @@ def measure(record: FinishRecord, judge: Judge, motions: PartMotions, level: int
     labels = [x[k] for x, k in zip(record.labels, known, strict=True)]
     found = measure_joints(shown, labels, record.after, motions.types, views, judge.stacks, both=both, **options)
     record.evidence = [replace(e, saved=own) for e, own in zip(found, own_shares(judge, motions), strict=True)]
-
-
-def make_joint(kind: str, transform: Tensor, centre: Tensor) -> Joint:
-    """A joint from its start -> end motion [4, 4]; ``centre`` [3] is the part's centre at the start (origin of a slide;
-    picks the origin on a hinge's axis nearest to it). The observed motion is the range."""
-    screw = se3.screw_parameters(transform.double())
-    if kind == "prismatic":
-        length = float(transform[:3, 3].norm())
-        axis = transform[:3, 3] / max(length, 1e-12)
-        return Joint("prismatic", axis, centre, length, (0.0, length), transform)
-    axis = screw.axis
-    origin = screw.origin + axis * ((centre - screw.origin) @ axis)
-    degrees = float(screw.angle) * 57.29577951308232
-    return Joint("revolute", axis, origin, degrees, (min(0.0, degrees), max(0.0, degrees)), transform)

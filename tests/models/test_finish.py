@@ -10,17 +10,9 @@ from tiny import hinge, photographs, slide, textured_panels
 
 from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
-from p2gs.models.finish import (
-    FinishConfig,
-    clean_labels,
-    constrain,
-    finish,
-    majority,
-    make_joint,
-    name_types,
-    state_labels,
-    surviving_slots,
-)
+from p2gs.models.finish import FinishConfig, finish
+from p2gs.models.joint_of import constrain, make_joint, name_types
+from p2gs.models.twin_labels import clean_labels, majority, state_labels, surviving_slots
 from p2gs.motion.joint_confidence import state_depth
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
@@ -187,7 +179,7 @@ def test_empty_and_unmoving_slots_vanish_with_a_word():
         states[0].gaussians, probs, ["prismatic"] * 3, torch.stack([slide(), idle, slide()]), torch.ones(3), 0.0
     )
     config = FinishConfig(polish=PolishConfig(steps=0), clean_neighbours=0)
-    assert surviving_slots(learned, learned.part_ids, config) == [1]
+    assert surviving_slots(learned, learned.part_ids, config.min_mass, config.min_motion) == [1]
     twin, notes, _ = finish(learned, states, views, config, Similarity(), seed=0, backend="auto")
     assert len(twin.parts) == 2 and len(notes) == 2 and "slot 2 of 3 vanished" in notes[0]
     assert twin.parts[1].joint.type == "prismatic" and int(twin.part_ids.max()) == 1

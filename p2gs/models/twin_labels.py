@@ -1,0 +1,110 @@
+"""Labels of the last stage: of the twin's Gaussians and, by the twin, of each state's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from p2gs.data.views import TrainingViews
+from p2gs.gaussians.handover import Articulation, StateGaussians
+from p2gs.gaussians.pose import carry, with_static
+from p2gs.ops import se3
+from p2gs.ops.knn import knn
+from p2gs.parts.islands import settle_twin_islands
+from p2gs.surface.contents import in_trays
+from p2gs.types import ArticulatedObject, GaussianTensors
+from p2gs.visibility.depth_stack import DepthStack
+
+UNKNOWN = 4.0  # a state's Gaussian farther than this from the twin, in the median's units, is none of the twin's
+
+
+def majority(labels: Tensor, neighbours: Tensor, weights: Tensor, parts: int) -> tuple[Tensor, Tensor]:
+    """Weighted majority of labels [M] over neighbours [N, k] (indices into labels), weights [N, k]: label [N] and its
+    share [N]."""
+    votes = torch.zeros(len(neighbours), parts)
+    votes.scatter_add_(1, labels[neighbours], weights)
+    share, label = votes.max(1)
+    return label, share / votes.sum(1).clamp_min(1e-9)
+
+
+def clean_labels(g: GaussianTensors, labels: Tensor, parts: int, k: int) -> Tensor:
+    """Labels [N] by the opacity-weighted majority of the k nearest Gaussians, each counting itself twice."""
+    if k <= 0 or len(labels) <= k:
+        return labels
+    _, index = knn(g.means, None, k, True)
+    own = torch.arange(len(labels))[:, None]
+    index = torch.cat([own, own, index], dim=1)
+    return majority(labels, index, torch.sigmoid(g.opacity_logits)[index], parts)[0]
+
+
+def surviving_slots(learned: Articulation, labels: Tensor, min_mass: float, min_motion: float) -> list[int]:
+    """Movable slots with mass and motion (``FinishConfig``), as slot numbers; labels [N]."""
+    solid = torch.sigmoid(learned.gaussians.opacity_logits) > 0.5
+    alive = []
+    for k in range(1, len(learned.types) + 1):
+        rows = solid & (labels == k)
+        mass = float(rows.sum()) / max(float(solid.sum()), 1.0)
+        if mass < min_mass:
+            continue
+        points = learned.gaussians.means[rows].double()
+        at = [
+            se3.apply(se3.screw_at(learned.transforms[k - 1], s - learned.canonical_time), points) for s in (0.0, 1.0)
+        ]
+        if float((at[1] - at[0]).norm(dim=1).mean()) >= min_motion:
+            alive.append(k)
+    return alive
+
+
+def state_labels(
+    learned: Articulation, labels: Tensor, state: StateGaussians, transforms: Tensor, k: int = 6
+) -> tuple[Tensor, Tensor]:
+    """Labels [M] of a single-state reconstruction by the twin posed in that state; margin = how far the majority
+    exceeds the rest, 0..1, or -1 for what the twin has nothing near of (lids that gave way to walls): the polish leaves
+    that out."""
+    posed = carry(
+        learned.gaussians, labels, se3.screw_at(with_static(transforms), state.state - learned.canonical_time)
+    )
+    solid = (torch.sigmoid(posed.opacity_logits) > 0.1).nonzero().squeeze(1)
+    distance, index = knn(posed.means[solid], state.gaussians.means, k, False)
+    spacing = distance[:, 0].median().clamp_min(1e-4)
+    weights = torch.exp(-(distance / (2 * spacing)).square()) + 1e-9
+    label, share = majority(labels[solid], index, weights, len(transforms) + 1)
+    margin = torch.where(distance[:, 0] > UNKNOWN * spacing, -1.0, 2 * share - 1)
+    return label, margin
+
+
+def settle_labels(
+    twin: ArticulatedObject,
+    views: dict[int, TrainingViews],
+    stacks: list[DepthStack],
+    *,
+    islands: float,
+    trays: int,
+    tau: float,
+    backend: str,
+) -> tuple[Tensor, int]:
+    """Labels [N] without islands, what is in drawers with these; and to how many Gaussians the latter happened.
+
+    twin: as learned, internal coordinates; views: photographs by state; stacks: rendered depth of both states; islands,
+    trays: see ``FinishConfig``; tau: tolerance of depth, internal units; backend: draws the twin for what is in
+    drawers.
+    """
+    fuller = round(twin.canonical_time)  # the state that shows more
+    T = torch.stack(
+        [torch.eye(4, dtype=torch.float64)] + [p.joint.transform for p in twin.parts[1:] if p.joint is not None]
+    )
+    away = se3.inverse(T) if fuller else T
+
+    def without_islands(labels: Tensor, held: Tensor | None = None) -> Tensor:
+        posed = carry(twin.gaussians, labels, se3.screw_at(T, fuller - twin.canonical_time))
+        return settle_twin_islands(posed, labels, islands, away, stacks[1 - fuller], tau, held)
+
+    labels = without_islands(twin.part_ids)
+    if trays <= 0:
+        return labels, 0
+    cameras = [(s, views[s].camera(i, -1)) for s in (0, 1) for i in views[s].spread(trays)]
+    settled, held = in_trays(replace(twin, part_ids=labels), cameras, backend)
+    count = int((settled != labels).sum())
+    return without_islands(settled, held) if count else labels, count
