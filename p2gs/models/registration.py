@@ -85,7 +85,8 @@ def align_states(
     found = fit_surfaces(surfels[1], surfels[0], config.reach * diagonal)
     T = found.transform if config.motion == "auto" else still
     tolerance = 4 * (surfels[0].noise ** 2 + surfels[1].noise ** 2) ** 0.5 + 2e-3 * diagonal
-    pair = Pair(*(s.gaussians.to(device) for s in states), views, tolerance, backend)
+    start, end = (s.gaussians.to(device) for s in states)
+    pair = Pair(start, end, views, tolerance, backend)
     held = [held_out(len(views[s])) for s in (1, 0)]
     fitted, judged = [h[0] for h in held], [h[1] for h in held]
     gain = pair.end_gain(T, fitted[0], config.levels[0]) if config.gain == "auto" else dark
