@@ -7,7 +7,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Optional
@@ -19,8 +19,9 @@ from p2gs.data.capture import frame, gains, given_masks, keypoint_fit, page, pos
 from p2gs.data.capture.auto_masks import auto_masks
 from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
+from p2gs.data.capture.facts import facts_of
 from p2gs.data.capture.hypotheses import Hypothesis, State
-from p2gs.data.capture.joint import is_end, join, state_bias
+from p2gs.data.capture.joint import is_end, join
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred, lens_groups
 from p2gs.data.capture.segmenters import segmenter_of
@@ -36,7 +37,6 @@ from p2gs.data.capture.static import (
 from p2gs.types import UserError
 
 STATES = ("start", "end")
-FORMAT = "p2gs-capture/1"
 MIN_SHARE = 0.9  # of a state's photographs must be placed
 MIN_ARC = 60.0  # degrees around the object
 MIN_REGISTERED = 8
@@ -125,7 +125,7 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     box = world.box_of(model, masks)
     left_out |= {s.name: (s.source, "its mask is empty") for s in shots if s.name not in masks}
     shots = [s for s in shots if s.name in masks]
-    facts |= _facts(model, shots, left_out, files, found, box)
+    facts |= facts_of(model, shots, left_out, files, found, box)
     (out / "capture.json").write_text(json.dumps(facts, indent=1))
     page.write_page(out, model, box, facts)
     return out
@@ -278,31 +278,3 @@ def _check_arc(model: Model, state: str) -> None:
                         "walk from one side of the front to the other, at two or three heights")  # fmt: skip
     if len(mine) < MIN_REGISTERED:
         raise few
-
-
-def _facts(model: Model, shots, left_out, files: dict[str, str], found: dict, box: np.ndarray) -> dict:
-    """What capture.json tells of the images, the states' bias and the colours."""
-    images = []
-    for shot in shots:
-        file = files.get(shot.name)
-        reason = None if file else "could not be placed well among the others"
-        images.append({"state": shot.name.split("/")[0], "source": shot.source, "file": file, "reason": reason})
-    images += [{"state": n.split("/")[0], "source": s, "file": None, "reason": why} for n, (s, why) in left_out.items()]
-    bias, (_, distance) = state_bias(model), model.centre()
-    known = bool(np.isfinite(bias.shift))
-    return {
-        "format": FORMAT,
-        "images": images,
-        "bias": {
-            "shift": bias.shift if known else None,
-            "turn_degrees": bias.turn if known else None,
-            "points": bias.points,
-            "share_of_distance": bias.shift / distance if known else None,
-        },
-        "share_of_points_in_both_states": bias.share,
-        "lenses": {str(k): {**asdict(lens), "params": lens.params.tolist()} for k, lens in model.lenses.items()},
-        "gains": {
-            files[p.name]: np.exp(found[k]).round(4).tolist() for k, p in model.photos.items() if p.name in files
-        },
-        "object_box": box.tolist(),
-    }
