@@ -51,10 +51,18 @@ def contact_sheet(folder: Path, files: list[str], out: Path, width: int = 240, c
         alpha = image[..., 3:] / 255
         grey = image[..., :3].mean(2, keepdims=True) * 0.35 + np.array([40, 110, 40], np.float32)
         tiles.append(np.clip(alpha * image[..., :3] + (1 - alpha) * grey, 0, 255).astype(np.uint8))
-    height = max(t.shape[0] for t in tiles)
-    tiles = [np.pad(t, ((0, height - t.shape[0]), (0, 0), (0, 0))) for t in tiles]
-    tiles += [np.zeros((height, width, 3), np.uint8)] * (-len(tiles) % columns)
-    cv2.imwrite(str(out), np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]))
+    rows = [_row(tiles[i : i + columns], columns * width) for i in range(0, len(tiles), columns)]
+    cv2.imwrite(str(out), np.vstack(rows))
+
+
+def _row(tiles: list[np.ndarray], width: int) -> np.ndarray:
+    """Pictures [h, w, 3] beside one another on black, [the tallest's h, width, 3]."""
+    row = np.zeros((max(t.shape[0] for t in tiles), width, 3), np.uint8)
+    at = 0
+    for tile in tiles:
+        row[: tile.shape[0], at : at + tile.shape[1]] = tile
+        at += tile.shape[1]
+    return row
 
 
 def _plan(model: Model, box: np.ndarray, axes: tuple[int, int], title: str) -> str:
