@@ -4,6 +4,7 @@ and most joints lie along one of them."""
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -149,6 +150,21 @@ def shared_axes(transforms: Tensor, types: list[str]) -> Tensor:
         if int(one_way(ways, ways[k]).sum()) > 1:
             out[k] = ways[k]
     return out
+
+
+def hinged_directions(motions: PartMotions) -> Tensor:
+    """[D, 3] (float64) what two hinges' axes agree on to ``KNOWN`` degrees, the mean of each such pair: measured twice
+    by motion, where few points tell which way a top or a front faces. Hinges on one line are one that was found
+    twice."""
+    found = [se3.screw_parameters(T.double()) for T, kind in zip(motions.transforms, motions.types, strict=True)
+             if kind == "revolute"]  # fmt: skip
+    out = []
+    for a, b in combinations(found, 2):
+        alike, between = a.axis @ b.axis, b.origin - a.origin
+        apart = float((between - a.axis * (a.axis @ between)).norm())
+        if abs(float(alike)) > math.cos(math.radians(KNOWN)) and apart > LINE:
+            out.append(torch.nn.functional.normalize(a.axis + torch.sign(alike) * b.axis, dim=0))
+    return torch.stack(out) if out else torch.zeros(0, 3).double()
 
 
 def has_own_axis(states: list[StateGaussians], motions: PartMotions, part: int, coarse: bool = False) -> bool:

@@ -10,23 +10,25 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
-from p2gs.motion.directions import KNOWN, WITHIN, axis_of, directions_of, shared_axes, turned_onto
+from p2gs.motion.directions import KNOWN, WITHIN, axis_of, directions_of, hinged_directions, shared_axes, turned_onto
 from p2gs.motion.discovery.rigid import one_way
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.relabel import relabelled
 
 
 def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMotions, list[dict]]:
-    """Each joint's axis that is askew to the directions of the object on the nearest of them, the rest refined, where
-    that costs at most ``price`` of energy (``Judge.gain``; 0, or no refinement: none is); with labels chosen anew where
-    the judge has discovery's surfaces.
+    """Each joint's axis that is askew to the directions of the object (its surfaces' and what two hinges agree on) on
+    the nearest of them, the rest refined, where that costs at most ``price`` of energy (``Judge.gain``; 0, or no
+    refinement: none is); with labels chosen anew where the judge has discovery's surfaces.
 
     Returns the motions and what was tried: part, type, degrees off, what it gained.
     """
     log: list[dict] = []
     if price <= 0 or judge.config.steps <= 0:
         return motions, log
-    directions = directions_of(judge.states, motions) if len(motions) else torch.zeros(0, 3)
+    directions = torch.zeros(0, 3)
+    if len(motions):
+        directions = torch.cat([directions_of(judge.states, motions), hinged_directions(motions)])
     held = torch.full((len(motions), 3), math.nan, dtype=torch.float64)
     for k, kind in enumerate(motions.types):
         if not bool(held[k].isnan().all()):

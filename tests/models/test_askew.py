@@ -8,7 +8,15 @@ import pytest
 import torch
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.motion.directions import axis_of, common_normal, directions_of, shared_axes, squared, turned_onto
+from p2gs.motion.directions import (
+    axis_of,
+    common_normal,
+    directions_of,
+    hinged_directions,
+    shared_axes,
+    squared,
+    turned_onto,
+)
 from p2gs.motion.screw_polish import PolishConfig, allowed_step, along_axes, apply_step
 from p2gs.ops import se3, so3
 from p2gs.parts.askew import keep_shared, lay_axes
@@ -43,6 +51,24 @@ def cube(state: int) -> StateGaussians:
     return StateGaussians(
         state, GaussianTensors(means, torch.cat(quats), scales, torch.full((2400,), 4.0), torch.zeros(2400, 1, 3))
     )
+
+
+def test_two_hinges_agree_on_a_direction():
+    def hinge(axis, origin, degrees):
+        axis = torch.nn.functional.normalize(torch.tensor(axis).double(), dim=0)
+        return se3.from_screw(axis, torch.tensor(origin).double(), math.radians(degrees))
+
+    def found(*hinges, kinds=None):
+        return hinged_directions(
+            PartMotions(kinds or ["revolute"] * len(hinges), torch.stack(hinges), torch.ones(len(hinges)), [], [])
+        )
+
+    left, right = hinge([0.005, 0, 1.0], [0.0, -0.4, 0.0], 60), hinge([0, 0.005, -1.0], [0.0, 0.4, 0.3], 50)
+    (both,) = found(left, right)
+    assert degrees_between(both, torch.tensor([0.0025, -0.0025, 1.0]).double()) < 0.01
+    assert len(found(left, hinge([0.005, 0, 1.0], [0.0, -0.39, 0.2], 40))) == 0  # on the left one's line
+    assert len(found(left, hinge([0.0, 0.04, 1.0], [0.0, 0.4, 0.0], 50))) == 0  # two degrees apart
+    assert len(found(left)) == 0 and len(found(left, right, kinds=["revolute", "prismatic"])) == 0
 
 
 def test_directions_of_a_cube_are_its_axes_to_a_tenth_of_a_degree():
