@@ -223,26 +223,25 @@ class SingleStatePhase(StatePhase):
     def forgive(self, step: int) -> None:
         """At their steps: decide which errors are looked for, cameras first, for a gain is told by pixels that lie on
         one another; measure gains and masks; photographs lose what is known of both; then all cameras."""
-        config, errors = self.config.forgive, self.errors
+        config, errors, size = self.config.forgive, self.errors, self.level(step)
         g, views = self.splats.tensors().detach(), self.views[self.state]
         first, *later = [round(share * self.total_steps) for share in (config.at, *config.measured)]
         bundled = [round(share * self.total_steps) for share in config.bundled]
         if step == first and config.cameras == "auto":
-            self.decide(1, "cameras", try_cameras(g, views, self.level(step), self.rasterizer))
+            self.decide(1, "cameras", try_cameras(g, views, size, self.rasterizer))
         if step in later and config.gains == "auto":
             if not bool(errors.decided[0]):
-                self.decide(0, "gains", try_gains(g, views, errors, self.level(step), self.rasterizer))
+                self.decide(0, "gains", try_gains(g, views, errors, size, self.rasterizer))
             if bool(errors.on[0]):
-                found = measure_gains(g, views, errors, self.level(step), self.rasterizer)
-                errors.log_gains += found.to(errors.log_gains)
+                errors.log_gains += measure_gains(g, views, errors, size, self.rasterizer)
         if step in bundled and config.masks == "auto" and (bool(errors.on[2]) or not bool(errors.decided[2])):
-            self.measure_masks(self.level(step))
+            self.measure_masks(size)
         known = torch.cat([errors.log_gains, errors.growths[:, None]], 1).cpu()
         if bool(known.any()) and (self.put_right is None or not torch.equal(known, self.put_right)):
             self.views[self.state] = TrainingViews(errors.views(self.shots), views.levels)
             self.put_right = known
         if step in bundled and bool(errors.on[1]):
-            errors.adjust(g, self.views[self.state], self.level(step), self.rasterizer)
+            errors.adjust(g, self.views[self.state], size, self.rasterizer)
 
     def measure_masks(self, size: int) -> None:
         """How wide masks are by pictures of ``size`` pixels; the first time, whether that is looked for."""

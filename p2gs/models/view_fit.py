@@ -37,14 +37,14 @@ LOOKS = 3  # of Gauss and Newton at half a photograph; each leaves a third to a 
 class ViewFitConfig:
     """What may be wrong with single photographs.
 
-    gains, cameras, masks: "auto" (photographs decide, once) or "never". at: share of the phase that is done when they
-    decide on cameras. measured: shares at which gains are measured; at the first, with the cameras put right, they
-    decide on them. bundled: shares at which masks are measured, the first time to decide on them, and then all cameras
-    are put right at once, by all pixels of the size that is trained on (``picture_bundle``); between them each follows
-    the model by its gradient. rate: of the cameras' Adam in internal units, falling to a hundredth. least: share by
-    which the other halves' errors must fall (of masks: clean scenes at most 0.8 %, masks off by up to two pixels 11.8
-    to 16.5 %); least_cameras: the same of cameras, which explain a coarse model's errors too: of clean scenes 3 to 4.3
-    %, of cameras off by a tenth of a degree 17.6 to 34 %.
+    gains, cameras, masks: "auto" (photographs decide, once) or "never".  at: share of the phase that is done when they
+    decide on cameras.  measured: shares at which gains are measured; at the first, with the cameras put right, they
+    decide on them.  bundled: shares at which masks are measured, the first time to decide on them, and then all cameras
+    are put right at once, by all pixels (``picture_bundle``); between them each follows the model by its gradient.  All
+    of it looks at pictures of the size that is trained on.  rate: of the cameras' Adam in internal units, falling to a
+    hundredth.  least: share by which the other halves' errors must fall (of masks: clean scenes at most 0.8 %, masks
+    off by up to two pixels 11.8 to 16.5 %); least_cameras: the same of cameras, which explain a coarse model's errors
+    too: of clean scenes 3 to 4.3 %, of cameras off by a tenth of a degree 17.6 to 34 %.
     """
 
     gains: Literal["auto", "never"] = "never"
@@ -154,11 +154,11 @@ class ViewErrors(nn.Module):
 def measure_gains(g: GaussianTensors, views: TrainingViews, errors: ViewErrors, size: int, backend: str) -> Tensor:
     """Natural logarithm [V, 3], float64, of how much brighter each photograph is than its rendering, mean zero; 0 where
     none can tell.  errors: what is known of the cameras."""
-    found = torch.zeros(len(views), 3, dtype=torch.float64)
+    found = torch.zeros_like(errors.log_gains)
     for index, shot in enumerate(errors.shots(views, size, g.means.device)):
         out = drawing(g, shot.camera, backend)
         gain = median_gain(shot.image, out.colour, (shot.alpha > 0.99) & (out.alpha > 0.99))
-        found[index] = 0 if gain is None else gain.double().cpu()
+        found[index] = 0 if gain is None else gain.double()
     return found - found.mean(0)
 
 

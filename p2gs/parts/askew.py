@@ -24,11 +24,9 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
     Returns the motions and what was tried: part, type, degrees off, what it gained.
     """
     log: list[dict] = []
-    if price <= 0 or judge.config.steps <= 0:
+    if price <= 0 or judge.config.steps <= 0 or not len(motions):
         return motions, log
-    directions = torch.zeros(0, 3)
-    if len(motions):
-        directions = torch.cat([directions_of(judge.states, motions), hinged_directions(motions)])
+    directions = torch.cat([directions_of(judge.states, motions), hinged_directions(motions)])
     held = torch.full((len(motions), 3), math.nan, dtype=torch.float64)
     for k, kind in enumerate(motions.types):
         if not bool(held[k].isnan().all()):
