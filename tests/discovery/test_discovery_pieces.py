@@ -15,12 +15,14 @@ from p2gs.data.generated.articulated import SyntheticPart, revolute
 from p2gs.data.generated.furniture import box
 from p2gs.motion.discovery.amounts import parted
 from p2gs.motion.discovery.config import DiscoveryConfig
+from p2gs.motion.discovery.explanations import ranked, total_score
 from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.discovery.finish import Explanation
-from p2gs.motion.discovery.hypotheses import Sweep
+from p2gs.motion.discovery.hypotheses import Sweep, static_axes
 from p2gs.motion.discovery.labels import REVEALED, Graph, Labelling, label, unary
-from p2gs.motion.discovery.pipeline import as_motions, discover, ranked, relabel, static_axes, total_score
+from p2gs.motion.discovery.pipeline import discover
 from p2gs.motion.discovery.problem import build_problem, evidence_masks, resampled
+from p2gs.motion.discovery.proposals import as_motions, relabel
 from p2gs.motion.discovery.refine import pattern_search
 from p2gs.motion.discovery.rigid import Motions, axes_used
 from p2gs.motion.discovery.rows import rows

@@ -3,9 +3,9 @@ selection, labels."""
 
 from p2gs.motion.discovery.config import DiscoveryConfig
 from p2gs.motion.discovery.leftover import left_over
-from p2gs.motion.discovery.pipeline import (
+from p2gs.motion.discovery.pipeline import discover
+from p2gs.motion.discovery.proposals import (
     as_motions,
-    discover,
     in_rows,
     in_two,
     instead_of,

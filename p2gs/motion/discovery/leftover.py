@@ -9,8 +9,8 @@ from torch import Tensor
 
 from p2gs.motion.discovery.hypotheses import angles_of, directions, static_axes, sweep
 from p2gs.motion.discovery.labels import label
-from p2gs.motion.discovery.pipeline import as_motions, sided, stacked
 from p2gs.motion.discovery.problem import Problem, resampled, smooth_mask
+from p2gs.motion.discovery.proposals import as_motions, sided, stacked
 from p2gs.motion.discovery.result import Discovery
 from p2gs.motion.discovery.rigid import Motions
 from p2gs.motion.discovery.search import ExclusiveGain, Search
