@@ -3,8 +3,8 @@
 
 One field of view for all views (``camera_angle_x``, ``camera_angle_y``), principal point in the centre, camera-to-world
 poses in OpenGL axes, depth (optional) as uint16 millimetres at the rgba path with ``rgba`` replaced by ``depth``.
-Beyond ArtGS itself, ``fl_x, fl_y, cx, cy`` of the file or of a frame are honoured. Format: ArtGS,
-scene/dataset_readers.py.
+Beyond ArtGS itself, ``fl_x, fl_y, cx, cy`` of the file or of a frame are honoured; ``w, h`` beside them are the image's
+size. Format: ArtGS, scene/dataset_readers.py.
 """
 
 from __future__ import annotations
@@ -46,6 +46,12 @@ def _number(value) -> float:
         return float(value)
     except (TypeError, ValueError, OverflowError):
         return math.nan
+
+
+def _size(both: dict) -> Optional[tuple[int, int]]:
+    """Width and height that ``w, h`` tell, None where they tell none."""
+    w, h = _number(both.get("w")), _number(both.get("h"))
+    return (int(w), int(h)) if math.isfinite(w) and math.isfinite(h) else None
 
 
 def depth_path(image: Path) -> Optional[Path]:
@@ -121,9 +127,9 @@ def index(root: Path, report: Report) -> list[Frame]:
                             f"{where} has time {short(entry['time'])}, but it is read as state {state} by the file's "
                             "name"
                         )
-                    frames.append(
-                        Frame(image.stem, state, split, image, viewmat, K=K, fov=fov, K_source=camera_file, depth=depth)
-                    )
+                    files = {"K_source": camera_file, "depth": depth}
+                    size = None if K is None else _size({**shared, **entry})
+                    frames.append(Frame(image.stem, state, split, image, viewmat, K, fov, size=size, **files))
                 if report.failed and intrinsics is None:
                     break  # the file's own intrinsics are wrong: once is enough
     with_depth = [f for f in frames if f.depth is not None]

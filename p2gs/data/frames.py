@@ -31,7 +31,8 @@ class Frame:
     depth: 16-bit PNG in millimetres or None.  viewmat: [4, 4] float64 world -> camera (OpenCV).
     K: [3, 3] float64 in pixels of the image file, or None when ``fov`` is given: (x, y) field of view in radians,
     principal point in the image's centre, y None for square pixels.
-    K_source: the file that the intrinsics come from, for messages.
+    K_source: the file that the intrinsics come from, for messages.  size: width and height of the image file that they
+    are for, or None where that is not told.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Frame:
     K: Optional[np.ndarray] = None
     fov: Optional[tuple[float, Optional[float]]] = None
     K_source: Optional[Path] = None
+    size: Optional[tuple[int, int]] = None
     mask: Optional[Path] = None
     depth: Optional[Path] = None
 
@@ -195,8 +197,11 @@ def check_frames(frames: list[Frame], root: Path, report: Report) -> None:
         a, b = train[0][0], train[1][0]
         differ = (a.K is None) != (b.K is None)
         if not differ:
-            differ = not np.allclose(a.intrinsics(100, 100), b.intrinsics(100, 100), rtol=1e-4)
+            focal = [f.intrinsics(100, 100)[[0, 1], [0, 1]] for f in (a, b)]
+            differ = not np.allclose(*focal, rtol=1e-4)
         if differ:
-            report.note(f"{root}: the two states were taken with different intrinsics ({a.K_source} and {b.K_source})")
+            report.note(
+                f"{root}: the two states were taken with different focal lengths ({a.K_source} and {b.K_source})"
+            )
     if frames and not any(f.split == "test" for f in frames):
         report.note(f"{root}: there are no test views, so image metrics cannot be taken on unseen views")

@@ -194,6 +194,11 @@ def _read_depth(frame: Frame, shape: tuple[int, int], report: Report) -> Optiona
 
 
 def _check_fit(K: np.ndarray, frame: Frame, width: int, height: int, report: Report) -> bool:
+    if frame.size not in (None, (width, height)):
+        report.error(
+            f"{frame.image}: is {width}x{height} pixels, but {frame.K_source} says {frame.size[0]}x{frame.size[1]}"
+        )
+        return False
     low, high = FOCAL_RANGE
     if not (low < K[0, 0] < high and low < K[1, 1] < high):
         report.error(
@@ -258,12 +263,13 @@ def read_view(frame: Frame, report: Report, downscale: float = 1.0, depth: Depth
 
 
 def check_sizes(frames: Sequence[Frame], views: Sequence[View], report: Report) -> None:
-    """One K is for one image size: an error names the first image that differs from those that share its K."""
+    """One K is for one image size: where no size is told with it, an error names the first image that differs from
+    those that share its K."""
     read = {(v.state, v.split, v.name): (v.camera.width, v.camera.height) for v in views}
     first: dict = {}
     for f in frames:
         size = read.get((f.state, f.split, f.name))
-        if f.K is None or size is None:
+        if f.K is None or f.size is not None or size is None:
             continue
         other, name = first.setdefault((f.K_source, f.K.tobytes()), (size, f.image.name))
         if size != other:

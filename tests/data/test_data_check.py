@@ -11,6 +11,8 @@ from p2gs.data.check import check_dataset
 from p2gs.data.modules import DATASETS
 from p2gs.types import UserError
 
+LENS = {"fl_x": 55.0, "fl_y": 55.0, "cx": 20.0, "cy": 20.0}
+
 
 def edit_json(path, change):
     value = json.loads(path.read_text())
@@ -112,6 +114,11 @@ FAULTS = {
     ),
     "distortion": ("artgs", start(lambda m: m.update(k1=0.1)), "lens distortion (k1) is not supported"),
     "no principal point": ("artgs", start(lambda m: m.update(fl_x=50)), "has fl_x but no principal point"),
+    "another size than told": (
+        "artgs",
+        start(lambda m: m.update(LENS, w=41, h=40)),
+        "0000.png: is 40x40 pixels, but",
+    ),
     "depth not 16 bit": (
         "artgs",
         picture("end/train/depth/0001.png", lambda d: d.astype(np.uint8)),
@@ -199,13 +206,24 @@ def test_fault_is_named_by_check_and_reader(copy_of, fault):
     assert str(raised.value) == errors[0]
 
 
+def test_windows_of_one_K_may_differ_in_size_that_is_told(copy_of):
+    """Two windows of photographs whose principal points lie alike may end at another column: a capture writes such."""
+    root = copy_of("artgs")
+    edit_image(root / "start/train/rgba/0001.png", lambda image: image[:, :39])
+    shutil.rmtree(root / "start/train/depth")
+    edit_json(
+        root / START, lambda m: [f.update(LENS, w=39 if k == 1 else 40, h=40) for k, f in enumerate(m["frames"])] and m
+    )
+    assert not [f.message for f in check_dataset(root, "artgs") if f.level == "error"]
+
+
 def replace_K(root):
     for split in ("train", "test"):
         edit_json(root / f"load/end/camera_{split}.json", lambda c: c.update(K=[[60, 0, 20], [0, 60, 20], [0, 0, 1]]))
 
 
 NOTES = {
-    "different intrinsics": ("paris", replace_K, "states were taken with different intrinsics"),
+    "different lenses": ("paris", replace_K, "states were taken with different focal lengths"),
     "off centre": (
         "paris",
         pad_right,
