@@ -13,7 +13,8 @@ from p2gs.gaussians import handover
 from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.losses.base import LOSSES
-from p2gs.models.articulation import ArticulationConfig, ArticulationPhase
+from p2gs.models.articulation import ArticulationPhase
+from p2gs.models.articulation_options import ArticulationConfig
 from p2gs.models.canonical_fusion import CanonicalFusionConfig, CanonicalFusionPhase
 from p2gs.models.sharpen import SharpenConfig, SharpenPhase
 from p2gs.models.single_state import SingleStateConfig, SingleStatePhase, SplatRates
