@@ -64,29 +64,47 @@ def test_the_object_is_told_from_the_room():
     assert np.median(overlaps) > 0.8, overlaps
 
 
-def test_a_hull_forgives_a_ragged_outline_and_leaves_out_what_stands_aside():
-    region = Region(np.array([0, 0, 0.5]), 3.0, np.array([[0.0, 0, 1, 0]]))
-    inside = np.random.default_rng(0).uniform((-0.3, -0.3, 0), (0.3, 0.3, 0.9), (60_000, 3))
-    aside = np.random.default_rng(1).uniform((0.9, -0.1, 0), (1.1, 0.1, 0.3), (20_000, 3))
-    outlines = []
+def outlined(*bodies: np.ndarray) -> list[tuple[Camera, list[np.ndarray]]]:
+    """What 24 cameras around see of bodies of points [N, 3]: the camera and a picture [96, 128] bool of each body."""
+    out = []
     for i, angle in enumerate(np.linspace(0, 2 * np.pi, 24, endpoint=False)):
         view = look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.0 + 0.5 * (i % 3)]), (0, 0, 0.5))
-        camera = Camera(torch.tensor(view).float(), torch.tensor(K).float(), 128, 96)
-        alone, outline = np.zeros((96, 128), bool), np.zeros((96, 128), bool)
-        for drawn, points in ((alone, inside), (outline, inside), (outline, aside)):
+        pictures = []
+        for points in bodies:
             local = points @ view[:3, :3].T + view[:3, 3]
             x, y = (local[:, :2] / local[:, 2:] @ K[:2, :2] + K[:2, 2]).astype(int).T
             shown = (x >= 0) & (x < 128) & (y >= 0) & (y < 96)
-            drawn[y[shown], x[shown]] = True
-        if i == 5:
-            outline[:, :64] = False  # half of it is missing in one photograph
-        outlines.append((camera, outline, alone))
-    hull = hull_of(region, [(c, o) for c, o, _ in outlines])
+            pictures.append(np.zeros((96, 128), bool))
+            pictures[-1][y[shown], x[shown]] = True
+        out.append((Camera(torch.tensor(view).float(), torch.tensor(K).float(), 128, 96), pictures))
+    return out
+
+
+REGION = Region(np.array([0, 0, 0.5]), 3.0, np.array([[0.0, 0, 1, 0]]))
+INSIDE = np.random.default_rng(0).uniform((-0.3, -0.3, 0), (0.3, 0.3, 0.9), (60_000, 3))
+ASIDE = np.random.default_rng(1).uniform((0.9, -0.1, 0), (1.1, 0.1, 0.3), (20_000, 3))
+
+
+def test_a_hull_forgives_a_ragged_outline_and_leaves_out_what_stands_aside():
+    outlines = [(camera, inside | aside, inside) for camera, (inside, aside) in outlined(INSIDE, ASIDE)]
+    outlines[5][1][:, :64] = False  # half of it is missing in one photograph
+    hull = hull_of(REGION, [(c, o) for c, o, _ in outlines])
     lo, hi = hull.points.min(0), hull.points.max(0)
     assert np.abs(lo - [-0.3, -0.3, 0]).max() < 0.1 and np.abs(hi - [0.3, 0.3, 0.9]).max() < 0.1
     camera, _, alone = outlines[5]
     assert (alone & hull.outline(camera))[:, :64].sum() > 0.95 * alone[:, :64].sum() > 100
-    assert len(hull_of(region, [(c, np.zeros_like(o)) for c, o, _ in outlines]).points) == 0
+    assert len(hull_of(REGION, [(c, np.zeros_like(o)) for c, o, _ in outlines]).points) == 0
+
+
+def test_a_front_that_hangs_in_the_air_is_the_objects():
+    """A drawer's front half a body's width before it, its sides too thin to show; a box stands on the floor."""
+    front = np.random.default_rng(2).uniform((0.6, -0.25, 0.3), (0.65, 0.25, 0.6), (20_000, 3))
+    beside = ASIDE * [1, -1, 1] + [0, 1.0, 0]
+    outlines = [(c, np.any(bodies, 0)) for c, bodies in outlined(INSIDE, front, beside)]
+    hull = hull_of(REGION, outlines)
+    assert abs(hull.points[:, 0].max() - 0.65) < 0.1 and hull.points[:, 1].max() < 0.45
+    for camera, (_, seen, _) in outlined(INSIDE, front, beside)[::5]:
+        assert (seen & hull.outline(camera)).sum() > 0.9 * seen.sum()
 
 
 def test_sharpening_moves_an_edge_to_the_picture_and_not_further():

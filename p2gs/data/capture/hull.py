@@ -42,7 +42,9 @@ class Hull:
 
 
 def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
-    """The body in the region's middle that ``outlines`` [h, w] bool have in common; without cells where none is.
+    """The body in the region's middle that ``outlines`` [h, w] bool have in common, and what hangs in the air: it must
+    hang on that body, as a front does whose drawer's sides are too thin to show, while what stands about stands on the
+    floor or leans on a wall. Without cells where there is no body.
 
     outlines: the camera and what is inside the outline, by photograph.
     """
@@ -52,8 +54,8 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
     side = np.arange(-reach, reach + step, step)
     grid = (len(side),) * 3
     points = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3) + region.centre
-    free = (points @ region.planes[:, :3].T > region.planes[:, 3]).all(1)
-    free = np.flatnonzero(free & (region.box is None or region.holds(points)))
+    above = (points @ region.planes[:, :3].T - region.planes[:, 3]).min(1)
+    free = np.flatnonzero((above > 0) & (region.box is None or region.holds(points)))
     seen, inside = np.zeros(len(free)), np.zeros(len(free))
     for camera, outline in outlines:
         x, y, _, shown = _projected(points[free], camera)
@@ -65,7 +67,11 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
     away = np.linalg.norm(points - region.centre, axis=1) / region.distance
     weight = np.bincount(bodies, np.exp(-((away / MIDDLE) ** 2)))
     weight[0] = 0.0
-    return Hull(points[(bodies == weight.argmax()) & solid], step)
+    lowest = np.full(len(weight), np.inf)
+    np.minimum.at(lowest, bodies, above)
+    kept = lowest > step  # a cell of air beneath
+    kept[weight.argmax()], kept[0] = True, False
+    return Hull(points[kept[bodies]], step)
 
 
 def _projected(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
