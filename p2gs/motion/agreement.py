@@ -14,6 +14,7 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.gaussians.pose import with_static
+from p2gs.motion.light import as_lit_there
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
@@ -50,7 +51,8 @@ def kept_and_shown(
     on[moving], through[moving] = met(stack, at[moving], config.free_moving)
     for end in ends(g[moving]):
         through[moving] |= met(stack, landed(end, labels[moving], T), config.free_static)[1]
-    like, part = alike(states, motions, state, at, config.other_colour)
+    lit = as_lit_there(states, motions, stacks, config.free_static, config.free_moving)
+    like, part = alike(lit[state], states[1 - state], motions, at, config.other_colour)
     own = (way[:, :3, :3] @ stacks[state].seen_from(g.means[moving], config.free_static)[..., None])[..., 0]
     same_side = (own * stack.seen_from(at[moving], config.free_moving)).sum(1) > 0
     behind = torch.zeros_like(on)
@@ -87,11 +89,12 @@ def ends(g: GaussianTensors) -> list[Tensor]:
 
 
 def alike(
-    states: list[StateGaussians], motions: PartMotions, state: int, at: Tensor, other_colour: float
+    one: StateGaussians, two: StateGaussians, motions: PartMotions, at: Tensor, other_colour: float
 ) -> tuple[Tensor, Tensor]:
-    """[N] bool each: is one of the other state's solid Gaussians next to ``at`` [N, 3] of the same part and of like
-    colour (0..1, mean of channels), and of the same part at all?"""
-    g, other = states[state].gaussians, states[1 - state].gaussians
+    """[N] bool each: is one of the other state's (``two``) solid Gaussians next to ``at`` [N, 3] of the same part as
+    the one of state ``one`` that lands there and of like colour (0..1, mean of channels), and of the same part at
+    all?"""
+    g, other, state = one.gaussians, two.gaussians, one.state
     solid = (torch.sigmoid(other.opacity_logits) > SOLID).nonzero().squeeze(1)
     if len(solid) < NEIGHBOURS:
         none = torch.zeros(len(at), dtype=torch.bool)

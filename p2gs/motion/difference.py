@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
-from p2gs.gaussians.handover import StateGaussians
 from p2gs.motion.joint_confidence import measuring_level
 from p2gs.motion.screw_polish import MovedGaussians
 from p2gs.ops.ssim import gaussian_window, ssim_map
+from p2gs.types import GaussianTensors
 
 LOOKS = 16  # photographs of a state, spread over all
 REACH = len(gaussian_window()) // 2  # pixels that SSIM looks around itself
@@ -17,8 +17,7 @@ REACH = len(gaussian_window()) // 2  # pixels that SSIM looks around itself
 
 @torch.no_grad()
 def image_losses(
-    state: StateGaussians,
-    explanations: list[tuple[Tensor, Tensor]],
+    explanations: list[tuple[GaussianTensors, Tensor, Tensor]],
     views: TrainingViews,
     ssim_lambda: float,
     shown,
@@ -29,10 +28,11 @@ def image_losses(
     explanations, summed over pixels, each weighted by how far the two pictures differ there (mean of channels) and by
     ``shown`` (as in ``Side``): [2] float64.
 
-    explanations: labels [N] (-1 leaves a Gaussian out) and motions [K, 4, 4] from this state to the photographs'.
+    explanations: the state's Gaussians as the photographs' light has them, labels [N] (-1 leaves a Gaussian out) and
+    motions [K, 4, 4] from this state to the photographs'.
     """
-    bodies = [MovedGaussians(state.gaussians, labels, device) for labels, _ in explanations]
-    moved = [body.moved(T) for body, (_, T) in zip(bodies, explanations, strict=True)]
+    bodies = [MovedGaussians(g, labels, device) for g, labels, _ in explanations]
+    moved = [body.moved(T) for body, (_, _, T) in zip(bodies, explanations, strict=True)]
     size, background = views.levels.index(measuring_level(views)), torch.full((3,), 0.5)
     total = torch.zeros(2, dtype=torch.float64)
     for index in views.spread(LOOKS):

@@ -16,6 +16,7 @@ from p2gs.motion.agreement import ShownPixels, kept_and_shown
 from p2gs.motion.difference import image_losses
 from p2gs.motion.discovery import Discovery, surface_energy
 from p2gs.motion.discovery.fields import Landing
+from p2gs.motion.light import as_lit_there
 from p2gs.motion.screw_polish import PolishConfig, Side, photometric_cost, polish
 from p2gs.native import at_once
 from p2gs.ops import se3
@@ -42,9 +43,10 @@ def sides_of(
     stacks: rendered depth of both states.
     """
     seen = what_counts(states, motions, config, stacks, backend=backend, device=device)
+    lit = as_lit_there(states, motions, stacks, config.free_static, config.free_moving)
     sides = []
     for s in (0, 1):
-        g = states[s].gaussians
+        g = lit[s].gaussians
         labels = torch.where(seen[s].kept, polish_labels(motions, s, config.min_margin), -1)
         seen_from = (
             stacks[s].seen_from(g.means.detach().cpu(), config.free_static or 0.02) if config.front > -1 else None
@@ -118,13 +120,14 @@ def explanation_cost(
     these motions).
     """
     seen = what_counts(states, motions, config, stacks, backend=backend, device=device) if seen is None else seen
+    lit = as_lit_there(states, motions, stacks, config.free_static, config.free_moving)
     ways = (motions.transforms, se3.inverse(motions.transforms))
     options = {"level": config.levels[-1] if level is None else level, "backend": backend, "device": device}
 
     def one_way(s: int) -> float:
         labels = torch.where(seen[s].kept, motions.labels[s], -1)
         there = {"shown": seen[1 - s].pixels, "hidden": HIDDEN}
-        return photometric_cost(states[s].gaussians, labels, ways[s], views[1 - s], **there, **options)
+        return photometric_cost(lit[s].gaussians, labels, ways[s], views[1 - s], **there, **options)
 
     return 0.5 * sum(at_once(one_way, (0, 1)))
 
@@ -209,8 +212,7 @@ class Judge:
             ways = [se3.inverse(m.transforms) if s else m.transforms for m in (tried, than)]
             drawn = [torch.where(seen[s].kept, m.labels[s], -1) for m in (tried, than)]
             return image_losses(
-                self.states[s],
-                list(zip(drawn, ways, strict=True)),
+                list(zip([states[s].gaussians for states in lit], drawn, ways, strict=True)),
                 self.views[1 - s],
                 self.config.ssim_lambda,
                 seen[1 - s].pixels,
@@ -219,6 +221,8 @@ class Judge:
             )
 
         both = [self.seen(tried), self.seen(than)]
+        near = self.config.free_static, self.config.free_moving
+        lit = [as_lit_there(self.states, m, self.stacks, *near) for m in (tried, than)]
         lost = torch.stack(at_once(one_way, [(s, seen) for s in (0, 1) for seen in both])).sum(0)
         return float(1 - lost[0] / lost[1]) if float(lost[1]) > 0 else 0.0
 
