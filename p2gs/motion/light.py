@@ -21,10 +21,9 @@ from p2gs.types import GaussianTensors
 from p2gs.visibility.depth_stack import DepthStack
 
 FEWEST = 10  # points of a part: the median of fewer is noise
-DARK = 0.02  # brightness, 0..1, below which a ratio is noise
-_FACING: WeakKeyDictionary[DepthStack, tuple] = (
-    WeakKeyDictionary()
-)  # what ``facing`` found last: Gaussians, tau, result
+DARK = 1 / 255  # one level of a photograph: what is darker has no ratio
+# what ``facing`` found last: Gaussians, tolerance, result
+_FACING: WeakKeyDictionary[DepthStack, tuple] = WeakKeyDictionary()
 
 
 def turning_gains(

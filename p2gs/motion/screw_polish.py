@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
+from p2gs.motion.light import FEWEST
 from p2gs.motion.part_pull import part_pulls
 from p2gs.ops import se3, so3
 from p2gs.ops.carry import Parts, carry
@@ -185,7 +186,7 @@ def polish(
         labels = torch.where(solid, side.labels, -1)
         bodies.append(MovedGaussians(side.gaussians, labels, device))
         fronts.append(None if side.seen_from is None else side.seen_from[labels >= 0].to(device))
-    enough = [torch.bincount(body.labels, minlength=len(types) + 1)[1:].cpu() >= 10 for body in bodies]
+    enough = [torch.bincount(body.labels, minlength=len(types) + 1)[1:].cpu() >= FEWEST for body in bodies]
     slides = torch.tensor([kind == "prismatic" for kind in types])
     anchors, radius = _anchors(sides, bodies, transforms)
     first, second = torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
