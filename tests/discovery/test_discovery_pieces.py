@@ -27,7 +27,7 @@ from p2gs.motion.discovery.refine import pattern_search
 from p2gs.motion.discovery.rigid import Motions, axes_used
 from p2gs.motion.discovery.rows import rows
 from p2gs.motion.discovery.search import Search
-from p2gs.motion.discovery.verify import violation
+from p2gs.motion.discovery.verify import gains_of, violation
 from p2gs.visibility.depth_stack import DepthStack, classify
 from p2gs.visibility.surfels import Surfels, window_planes
 
@@ -164,6 +164,21 @@ def test_where_a_part_lands_on_another_it_is_as_wrong_as_in_empty_space(stacked)
     lost = Labelling([torch.eye(3)[torch.zeros(len(p), dtype=torch.long)] for p in right.probability], right.cost)
     moved = problem.moved[1].nonzero()[:, 0]
     assert bool((violation(problem, truth, lost, 1, moved) == 1).all())  # what moved is called static
+
+
+def test_a_door_that_turned_out_of_the_light_is_no_contradiction(stacked):
+    problem, graphs, _, truth = stacked
+    right = label(problem, truth, graphs)
+    end, mine = problem.surfels[1], (right.labels(1) == 1)[:, None]
+    dark = replace(end, colours=torch.where(mine, 0.4 * end.colours, end.colours))
+    shaded = replace(problem, surfels=[problem.surfels[0], dark])
+    assert float(gains_of(shaded, truth, right)[0]) == pytest.approx(
+        0.4 * float(gains_of(problem, truth, right)[0]), rel=0.02
+    )
+    index = (right.labels(0) == 1).nonzero()[:, 0]
+    before, lit = (float(violation(p, truth, right, 0, index).mean()) for p in (problem, shaded))
+    unlit = float(violation(shaded, truth, right, 0, index, gains=torch.ones(2)).mean())
+    assert abs(lit - before) < 0.02 and unlit > lit + 0.2
 
 
 def test_what_its_own_plates_other_side_hides_costs_less_than_what_anything_hides():
