@@ -44,8 +44,9 @@ demo: setup
 	$(BIN)/p2gs fit -c configs/demo.yaml
 	$(BIN)/p2gs test runs/demo
 
+# Two files of tests at once, each with half of the threads.
 test: setup-dev
-	$(BIN)/python -m pytest --timeout=300
+	$(BIN)/python -m pytest -n 2 --dist loadfile --timeout=300
 
 # Style, layout, types of the rooms that pass, and which way imports point: under a minute.
 lint: setup-dev
