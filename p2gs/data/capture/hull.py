@@ -63,7 +63,7 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
         inside[shown] += outline[y[shown], x[shown]]
     solid = np.zeros(len(points), bool)
     solid[free] = (seen >= FEWEST) & (inside >= IN_HULL * seen)
-    bodies = np.asarray(label(solid.reshape(grid), np.ones((3, 3, 3)))[0]).ravel()  # type: ignore[index]
+    bodies = np.asarray(label(solid.reshape(grid), np.ones((3, 3, 3)))[0], np.int64).ravel()  # type: ignore[index]
     away = np.linalg.norm(points - region.centre, axis=1) / region.distance
     weight = np.bincount(bodies, np.exp(-((away / MIDDLE) ** 2)))
     weight[0] = 0.0
