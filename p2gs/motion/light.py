@@ -68,10 +68,10 @@ def as_lit_there(
     """Both states with the colours of turning parts as the other state's light has them.
 
     stacks: rendered depth of both states.  static, moving: tolerances, internal units, for a Gaussian that is seen on
-    its own state's surface and for one that lands on the other's.
+    its own state's surface and for one that lands on the other's; where one is 0 nothing is asked (``what_counts``).
     """
     turns = [kind == "revolute" for kind in motions.types]
-    if not any(turns):
+    if not any(turns) or min(static, moving) <= 0:
         return states
     points, normals, colours, labels = [], [], [], []
     for state, of, stack in zip(states, motions.labels, stacks, strict=True):
