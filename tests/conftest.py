@@ -11,8 +11,8 @@ from pathlib import Path
 # before torch: spinning threads would take the cores from the kernels
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # of several processes (pytest -n) each has its share of the cores
-    share = max((os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]), 1)
-    os.environ.setdefault("OMP_NUM_THREADS", str(share))
+    _processes = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    os.environ.setdefault("OMP_NUM_THREADS", str(max((os.cpu_count() or 1) // _processes, 1)))
 
 import numpy as np
 import pytest

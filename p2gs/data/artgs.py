@@ -127,9 +127,10 @@ def index(root: Path, report: Report) -> list[Frame]:
                             f"{where} has time {short(entry['time'])}, but it is read as state {state} by the file's "
                             "name"
                         )
-                    files = {"K_source": camera_file, "depth": depth}
                     size = None if K is None else _size({**shared, **entry})
-                    frames.append(Frame(image.stem, state, split, image, viewmat, K, fov, size=size, **files))
+                    frames.append(
+                        Frame(image.stem, state, split, image, viewmat, K, fov, camera_file, size, depth=depth)
+                    )
                 if report.failed and intrinsics is None:
                     break  # the file's own intrinsics are wrong: once is enough
     with_depth = [f for f in frames if f.depth is not None]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.gaussians.pose import with_static
-from p2gs.motion.light import as_lit_there
+from p2gs.motion.light import seen_from
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
@@ -31,7 +31,12 @@ NEIGHBOURS = 4  # of the other state's Gaussians, one of which must be like the 
 
 
 def kept_and_shown(
-    states: list[StateGaussians], motions: PartMotions, state: int, stacks: list[DepthStack], config: PolishConfig
+    states: list[StateGaussians],
+    motions: PartMotions,
+    state: int,
+    lit: GaussianTensors,
+    stacks: list[DepthStack],
+    config: PolishConfig,
 ) -> tuple[Tensor, Tensor]:
     """Of the Gaussians of ``state``, [N] bool each: which nothing contradicts in the other state, and which the other
     state shows.
@@ -40,7 +45,7 @@ def kept_and_shown(
     the same part, of like colour and from the side that its own state shows. It is contradicted where they see through
     it or its ends (it reaches over the edge of what it was labelled with), and where it lies on a surface that is not
     like it. Inside and behind, where nobody looks, nothing is, nor on a thin plate's other side, which hides it.
-    stacks: rendered depth of both states.
+    lit: the state's Gaussians as the other's light has them (``as_lit_there``).  stacks: rendered depth of both states.
     """
     g, labels = states[state].gaussians, motions.labels[state]
     T = se3.inverse(motions.transforms) if state else motions.transforms
@@ -51,9 +56,8 @@ def kept_and_shown(
     on[moving], through[moving] = met(stack, at[moving], config.free_moving)
     for end in ends(g[moving]):
         through[moving] |= met(stack, landed(end, labels[moving], T), config.free_static)[1]
-    lit = as_lit_there(states, motions, stacks, config.free_static, config.free_moving)
-    like, part = alike(lit[state], states[1 - state], motions, at, config.other_colour)
-    own = (way[:, :3, :3] @ stacks[state].seen_from(g.means[moving], config.free_static)[..., None])[..., 0]
+    like, part = alike(states, motions, state, at, dc_to_rgb(lit.sh[:, 0]).clamp(0, 1), config.other_colour)
+    own = (way[:, :3, :3] @ seen_from(g, stacks[state], config.free_static)[moving].to(way)[..., None])[..., 0]
     same_side = (own * stack.seen_from(at[moving], config.free_moving)).sum(1) > 0
     behind = torch.zeros_like(on)
     behind[moving] = part[moving] & ~same_side
@@ -89,18 +93,17 @@ def ends(g: GaussianTensors) -> list[Tensor]:
 
 
 def alike(
-    one: StateGaussians, two: StateGaussians, motions: PartMotions, at: Tensor, other_colour: float
+    states: list[StateGaussians], motions: PartMotions, state: int, at: Tensor, colours: Tensor, other_colour: float
 ) -> tuple[Tensor, Tensor]:
-    """[N] bool each: is one of the other state's (``two``) solid Gaussians next to ``at`` [N, 3] of the same part as
-    the one of state ``one`` that lands there and of like colour (0..1, mean of channels), and of the same part at
-    all?"""
-    g, other, state = one.gaussians, two.gaussians, one.state
+    """[N] bool each: is one of the other state's solid Gaussians next to ``at`` [N, 3] of the same part and of like
+    colour (``colours`` [N, 3] in 0..1, mean of channels), and of the same part at all?"""
+    other = states[1 - state].gaussians
     solid = (torch.sigmoid(other.opacity_logits) > SOLID).nonzero().squeeze(1)
     if len(solid) < NEIGHBOURS:
         none = torch.zeros(len(at), dtype=torch.bool)
         return none, none
     near = solid[knn(other.means[solid].contiguous(), at.contiguous(), NEIGHBOURS)[1]]
-    colours, theirs = dc_to_rgb(g.sh[:, 0]).clamp(0, 1), dc_to_rgb(other.sh[:, 0]).clamp(0, 1)
+    theirs = dc_to_rgb(other.sh[:, 0]).clamp(0, 1)
     apart = (theirs[near] - colours[:, None]).abs().mean(-1)
     same = motions.labels[1 - state][near] == motions.labels[state][:, None]
     return (same & (apart < other_colour)).any(1), same.any(1)

@@ -7,6 +7,7 @@ same part and side, of how much brighter the end has it. A slide faces the lamps
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
@@ -22,8 +23,8 @@ from p2gs.visibility.depth_stack import DepthStack
 
 FEWEST = 10  # points of a part: the median of fewer is noise
 DARK = 1 / 255  # one level of a photograph: what is darker has no ratio
-# what ``facing`` found last: Gaussians, tolerance, result
-_FACING: WeakKeyDictionary[DepthStack, tuple] = WeakKeyDictionary()
+# what ``seen_from`` and ``facing`` found last: Gaussians, tolerance, results
+_SEEN: WeakKeyDictionary[DepthStack, tuple] = WeakKeyDictionary()
 
 
 def turning_gains(
@@ -31,7 +32,7 @@ def turning_gains(
     normals: list[Tensor],
     colours: list[Tensor],
     labels: list[Tensor],
-    transforms: Tensor,
+    transforms: Sequence[Tensor],
     turns: list[bool],
     reach: float,
 ) -> Tensor:
@@ -39,8 +40,8 @@ def turning_gains(
     than ``FEWEST`` points are seen in both.
 
     By state: points [N, 3], normals [N, 3] towards whoever sees them (0: nobody does), colours [N, 3] in 0..1, labels
-    [N]. transforms [K, 4, 4] start -> end.  turns: which of them turn.  reach: how far apart what is one place in both
-    states may lie.
+    [N]. transforms: [4, 4] start -> end of each part.  turns: which of them turn.  reach: how far apart what is one
+    place in both states may lie.
     """
     gains = torch.ones(len(turns))
     bright = [c.mean(1).clamp_min(DARK).log() for c in colours]
@@ -80,7 +81,7 @@ def as_lit_there(
         normals.append(facing(g, stack, static))
         colours.append(dc_to_rgb(g.sh[:, 0]).clamp(0, 1).detach().cpu())
         labels.append(torch.where(normals[-1].any(1), of, -1))
-    gains = turning_gains(points, normals, colours, labels, motions.transforms, turns, moving)
+    gains = turning_gains(points, normals, colours, labels, list(motions.transforms), turns, moving)
     return [
         replace(state, gaussians=brighter(state.gaussians, of, 1 / gains if s else gains))
         for s, (state, of) in enumerate(zip(states, motions.labels, strict=True))
@@ -88,16 +89,25 @@ def as_lit_there(
 
 
 def facing(g: GaussianTensors, stack: DepthStack, tau: float) -> Tensor:
-    """[N, 3] the shortest axis of each Gaussian, towards the cameras that see it on a surface; 0 where none does. Found
-    once for a stack: no motion changes it."""
-    known = _FACING.get(stack)
+    """[N, 3] the shortest axis of each Gaussian, towards the cameras that see it on a surface; 0 where none does."""
+    return _seen(g, stack, tau)[1]
+
+
+def seen_from(g: GaussianTensors, stack: DepthStack, tau: float) -> Tensor:
+    """``DepthStack.seen_from`` of a state's own Gaussians, on the CPU."""
+    return _seen(g, stack, tau)[0]
+
+
+def _seen(g: GaussianTensors, stack: DepthStack, tau: float) -> tuple[Tensor, Tensor]:
+    """Of ``seen_from`` and ``facing``: found once for a stack, as no motion changes it."""
+    known = _SEEN.get(stack)
     if known is None or known[0] is not g or known[1] != tau:
-        R = so3.quat_to_matrix(so3.quat_normalize(g.quats.detach().cpu()))
-        shortest = g.log_scales.detach().cpu().argmin(1)
+        own = g.detach().to("cpu")
+        R, shortest = so3.quat_to_matrix(so3.quat_normalize(own.quats)), own.log_scales.argmin(1)
         normal = R.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
-        seen = (normal * stack.seen_from(g.means.detach().cpu(), tau)).sum(1, keepdim=True)
-        known = _FACING[stack] = (g, tau, normal * seen.sign())
-    return known[2]
+        ways = stack.seen_from(own.means, tau)
+        known = _SEEN[stack] = (g, tau, ways, normal * (normal * ways).sum(1, keepdim=True).sign())
+    return known[2], known[3]
 
 
 def brighter(g: GaussianTensors, labels: Tensor, gains: Tensor) -> GaussianTensors:

@@ -16,10 +16,11 @@ from p2gs.motion.agreement import ShownPixels, kept_and_shown
 from p2gs.motion.difference import image_losses
 from p2gs.motion.discovery import Discovery, surface_energy
 from p2gs.motion.discovery.fields import Landing
-from p2gs.motion.light import as_lit_there
+from p2gs.motion.light import as_lit_there, seen_from
 from p2gs.motion.screw_polish import PolishConfig, Side, photometric_cost, polish
 from p2gs.native import at_once
 from p2gs.ops import se3
+from p2gs.types import GaussianTensors
 from p2gs.visibility.depth_stack import DepthStack
 
 # What a pixel costs that the other state hides: as much of the loss of one without any likeness (1 of 1 - SSIM,
@@ -43,15 +44,11 @@ def sides_of(
     stacks: rendered depth of both states.
     """
     seen = what_counts(states, motions, config, stacks, backend=backend, device=device)
-    lit = as_lit_there(states, motions, stacks, config.free_static, config.free_moving)
     sides = []
     for s in (0, 1):
-        g = lit[s].gaussians
         labels = torch.where(seen[s].kept, polish_labels(motions, s, config.min_margin), -1)
-        seen_from = (
-            stacks[s].seen_from(g.means.detach().cpu(), config.free_static or 0.02) if config.front > -1 else None
-        )
-        sides.append(Side(g, labels, views[1 - s], s == 1, seen_from, seen[1 - s].pixels))
+        ways = seen_from(states[s].gaussians, stacks[s], config.free_static or 0.02) if config.front > -1 else None
+        sides.append(Side(seen[s].lit, labels, views[1 - s], s == 1, ways, seen[1 - s].pixels))
     return sides
 
 
@@ -110,24 +107,25 @@ def explanation_cost(
     backend: str,
     level: int | None = None,
     seen: list[Seen] | None = None,
+    by: list[Seen] | None = None,
     device="cpu",
 ) -> float:
     """Image loss of each state's Gaussians moved into the other state's photographs, both directions averaged.
 
     Of the Gaussians those that nothing contradicts are drawn (``kept_and_shown``); pixels of surface that the other
     state hides cost ``HIDDEN`` instead of what is wrong in them, which no motion could mend.  level: size of the
-    photographs (None: ``config``'s last).  seen: what is drawn and what counts, of ``what_counts`` (None: found for
-    these motions).
+    photographs (None: ``config``'s last).  seen: of ``what_counts`` for these motions (None: found).  by: the same for
+    the motions that say what is drawn and what counts (None: these).
     """
     seen = what_counts(states, motions, config, stacks, backend=backend, device=device) if seen is None else seen
-    lit = as_lit_there(states, motions, stacks, config.free_static, config.free_moving)
+    by = seen if by is None else by
     ways = (motions.transforms, se3.inverse(motions.transforms))
     options = {"level": config.levels[-1] if level is None else level, "backend": backend, "device": device}
 
     def one_way(s: int) -> float:
-        labels = torch.where(seen[s].kept, motions.labels[s], -1)
-        there = {"shown": seen[1 - s].pixels, "hidden": HIDDEN}
-        return photometric_cost(lit[s].gaussians, labels, ways[s], views[1 - s], **there, **options)
+        labels = torch.where(by[s].kept, motions.labels[s], -1)
+        there = {"shown": by[1 - s].pixels, "hidden": HIDDEN}
+        return photometric_cost(seen[s].lit, labels, ways[s], views[1 - s], **there, **options)
 
     return 0.5 * sum(at_once(one_way, (0, 1)))
 
@@ -183,7 +181,7 @@ class Judge:
     def cost(self, motions: PartMotions, by: PartMotions | None = None) -> float:
         """Image loss (``explanation_cost``) of what counts under the motions ``by`` (None: under these)."""
         by = motions if by is None else by
-        options = {"seen": self.seen(by), "backend": self.backend, "device": self.device}
+        options = {"seen": self.seen(motions), "by": self.seen(by), "backend": self.backend, "device": self.device}
         ask = partial(explanation_cost, self.states, motions, self.views, self.config, self.stacks, **options)
         return ask() if by is not motions else self._asked(motions, "cost", ask)
 
@@ -198,6 +196,8 @@ class Judge:
         def ratio(by: PartMotions) -> float:
             return max(self.cost(than, by), 1e-9) / max(self.cost(tried, by), 1e-9)
 
+        for motions in (tried, than):
+            self.seen(motions)  # once, and not in both threads
         return 0.5 * sum(map(math.log, at_once(ratio, (tried, than))))
 
     def own_share(self, tried: PartMotions, than: PartMotions) -> float:
@@ -212,7 +212,7 @@ class Judge:
             ways = [se3.inverse(m.transforms) if s else m.transforms for m in (tried, than)]
             drawn = [torch.where(seen[s].kept, m.labels[s], -1) for m in (tried, than)]
             return image_losses(
-                list(zip([states[s].gaussians for states in lit], drawn, ways, strict=True)),
+                list(zip([of[s].lit for of in both], drawn, ways, strict=True)),
                 self.views[1 - s],
                 self.config.ssim_lambda,
                 seen[1 - s].pixels,
@@ -221,8 +221,6 @@ class Judge:
             )
 
         both = [self.seen(tried), self.seen(than)]
-        near = self.config.free_static, self.config.free_moving
-        lit = [as_lit_there(self.states, m, self.stacks, *near) for m in (tried, than)]
         lost = torch.stack(at_once(one_way, [(s, seen) for s in (0, 1) for seen in both])).sum(0)
         return float(1 - lost[0] / lost[1]) if float(lost[1]) > 0 else 0.0
 
@@ -264,9 +262,10 @@ class Judge:
 
 @dataclass
 class Seen:
-    """Of a state: which Gaussians [N] nothing contradicts in the other state; the weight of its photographs' pixels
-    (None: all count alike)."""
+    """Of a state: its Gaussians as the other state's light has them; which of them [N] nothing contradicts there; the
+    weight of its photographs' pixels (None: all count alike)."""
 
+    lit: GaussianTensors
     kept: Tensor
     pixels: ShownPixels | None
 
@@ -277,10 +276,13 @@ def what_counts(
     """Of both states, under these motions. Pixels count as far as they are not of surface that the other state hides;
     everything does where a tolerance of ``config`` is 0."""
 
+    lit = as_lit_there(states, motions, stacks, config.free_static, config.free_moving)
+
     def of(s: int) -> Seen:
+        g = lit[s].gaussians
         if config.free_static <= 0 or config.free_moving <= 0:
-            return Seen(torch.ones(len(motions.labels[s]), dtype=torch.bool), None)
-        kept, shown = kept_and_shown(states, motions, s, stacks, config)
-        return Seen(kept, ShownPixels(states[s], shown | ~kept, backend, device))
+            return Seen(g, torch.ones(len(motions.labels[s]), dtype=torch.bool), None)
+        kept, shown = kept_and_shown(states, motions, s, g, stacks, config)
+        return Seen(g, kept, ShownPixels(states[s], shown | ~kept, backend, device))
 
     return at_once(of, (0, 1))

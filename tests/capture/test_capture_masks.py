@@ -100,10 +100,10 @@ def test_a_front_that_hangs_in_the_air_is_the_objects():
     """A drawer's front half a body's width before it, its sides too thin to show; a box stands on the floor."""
     front = np.random.default_rng(2).uniform((0.6, -0.25, 0.3), (0.65, 0.25, 0.6), (20_000, 3))
     beside = ASIDE * [1, -1, 1] + [0, 1.0, 0]
-    outlines = [(c, np.any(bodies, 0)) for c, bodies in outlined(INSIDE, front, beside)]
-    hull = hull_of(REGION, outlines)
+    drawn = outlined(INSIDE, front, beside)
+    hull = hull_of(REGION, [(c, np.any(bodies, 0)) for c, bodies in drawn])
     assert abs(hull.points[:, 0].max() - 0.65) < 0.1 and hull.points[:, 1].max() < 0.45
-    for camera, (_, seen, _) in outlined(INSIDE, front, beside)[::5]:
+    for camera, (_, seen, _) in drawn[::5]:
         assert (seen & hull.outline(camera)).sum() > 0.9 * seen.sum()
 
 

@@ -223,7 +223,7 @@ def replace_K(root):
 
 
 NOTES = {
-    "different lenses": ("paris", replace_K, "states were taken with different focal lengths"),
+    "different intrinsics": ("paris", replace_K, "states were taken with different intrinsics"),
     "off centre": (
         "paris",
         pad_right,

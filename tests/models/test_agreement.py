@@ -37,7 +37,7 @@ def asked(start: GaussianTensors, labels, end: GaussianTensors, end_labels, end_
         ["prismatic"], T, torch.ones(1), [labels, end_labels], [torch.ones(len(labels)), torch.ones(len(end_labels))]
     )
     states = [StateGaussians(0, start), StateGaussians(1, end)]
-    return kept_and_shown(states, motions, 0, [facing(0.0), end_stack], CONFIG)
+    return kept_and_shown(states, motions, 0, start, [facing(0.0), end_stack], CONFIG)
 
 
 def grid(x: float, half: float = 0.3, n: int = 13) -> torch.Tensor:

@@ -39,7 +39,7 @@ def test_gain_is_of_the_pixels_of_both():
     told = 0.0
     for by in (true, false):
         seen = what_counts(judge.states, by, CONFIG, judge.stacks, backend="auto")
-        options = {"seen": seen, "backend": "auto"}
+        options = {"by": seen, "backend": "auto"}
         cost = [explanation_cost(judge.states, m, judge.views, CONFIG, judge.stacks, **options) for m in (true, false)]
         told += 0.5 * math.log(cost[1] / cost[0])
     assert judge.gain(true, false) == pytest.approx(told, rel=1e-6) and told > 0.1

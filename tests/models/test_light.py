@@ -80,10 +80,10 @@ def test_what_turned_into_the_light_is_shown_there():
     states, motions = turned_by(math.pi / 2, 0.6)
     stacks = [seen_along_x(0.0)] * 2
     assert abs(dc_to_rgb(torch.tensor(0.6)) - dc_to_rgb(torch.tensor(-1.0))) > 2 * CONFIG.other_colour
-    lit = as_lit_there(states, motions, [seen_along_x(0.0), seen_along_x(0.0)], CONFIG.free_static, CONFIG.free_moving)
+    lit = as_lit_there(states, motions, stacks, CONFIG.free_static, CONFIG.free_moving)
     for s in (0, 1):
         assert torch.allclose(lit[s].gaussians.sh, states[1 - s].gaussians.sh, atol=1e-5)
-    kept, shown = kept_and_shown(states, motions, 0, stacks, CONFIG)
+    kept, shown = kept_and_shown(states, motions, 0, lit[0].gaussians, stacks, CONFIG)
     assert kept.all() and shown.all()
 
 
@@ -93,4 +93,6 @@ def test_another_hue_is_no_light():
     states[1] = StateGaussians(
         1, GaussianTensors(*(getattr(states[1].gaussians, n) for n in GaussianTensors.NAMES[:4]), red)
     )
-    assert not kept_and_shown(states, motions, 0, [seen_along_x(0.0)] * 2, CONFIG)[1].any()
+    stacks = [seen_along_x(0.0)] * 2
+    lit = as_lit_there(states, motions, stacks, CONFIG.free_static, CONFIG.free_moving)
+    assert not kept_and_shown(states, motions, 0, lit[0].gaussians, stacks, CONFIG)[1].any()

@@ -71,11 +71,9 @@ def test_an_interrupt_stops_both_and_keeps_what_they_have(tmp_path):
         assert state["global_step"] == done["completed"] > 0  # between two steps
 
 
-def test_a_mistake_is_told_as_one(tmp_path):
-    with (
-        SideStage(tmp_path / "nothing", "single_state_1", 1) as other,
-        pytest.raises(UserError, match="config file .* is not there"),
-    ):
+def test_a_mistake_is_told_as_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a long path is told shortened
+    with SideStage(Path("nothing"), "single_state_1", 1) as other, pytest.raises(UserError, match="config.yaml"):
         other.wait()
 
 

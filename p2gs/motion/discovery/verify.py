@@ -23,7 +23,7 @@ def gains_of(problem: Problem, motions: Motions, labelling: Labelling) -> Tensor
     """[K] how much brighter each part is at the end (``turning_gains``)."""
     surfels, labels = problem.surfels, [labelling.labels(s) for s in (0, 1)]
     points, normals, colours = ([getattr(s, name) for s in surfels] for name in ("points", "normals", "colours"))
-    transforms = torch.stack([motions.transform(k) for k in range(len(motions))]) if len(motions) else torch.zeros(0)
+    transforms = [motions.transform(k) for k in range(len(motions))]
     reach = 2 * problem.scale.spacing + problem.scale.tp
     return turning_gains(points, normals, colours, labels, transforms, motions.turn.tolist(), reach)
 
