@@ -23,7 +23,7 @@ from p2gs.motion.survey import leave_false_minima
 from p2gs.ops import se3
 from p2gs.parts.askew import keep_shared, lay_axes
 from p2gs.parts.options import PartMotionsConfig
-from p2gs.parts.part_choices import drop_needless, own_shares, settle_types
+from p2gs.parts.part_choices import drop_needless, drop_untold, own_shares, settle_types
 from p2gs.types import ArticulatedObject, GaussianTensors, Part, Similarity
 
 
@@ -36,7 +36,8 @@ class FinishConfig:
     screws frozen. min_mass: a slot with a smaller share of the solid Gaussians vanishes. min_motion: likewise one that
     moves its points by less (internal units).
     part_penalty: share of the image loss in its own pixels that a part with an axis of its own must save against being
-    static or one with a part that it touches, as in discovery (0: parts stay).
+    static or one with a part that it touches, as in discovery (0: parts stay). min_confidence: a part of less vanishes,
+    as in discovery (0: none does).
     askew: share of the image loss that an axis which is askew to the object's directions must save against one along
     them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a
     slide, and a turn by less is one unless it explains the photographs better by freedom_penalty (share of the image
@@ -60,6 +61,7 @@ class FinishConfig:
     min_mass: float = 0.002
     min_motion: float = 0.01
     part_penalty: float = PartMotionsConfig.part_penalty
+    min_confidence: float = PartMotionsConfig.min_confidence
     askew: float = 0.04  # sharp photographs prefer a plain front beside its place by up to 0.036
     prismatic_below: float = 5.0
     freedom_penalty: float = PartMotionsConfig.freedom_penalty
@@ -142,15 +144,9 @@ def finish(
         judge = Judge(None, states, views, config.polish, stacks, **options)
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         refined, record.laid = _refined(judge, motions, axes, config)
-        refined, labels, gone = drop_needless(judge, refined, labels, config.part_penalty)
-        for part in gone:
-            notes.append(f"slot {alive.pop(part['part'])} of {len(learned.types)} vanished: {part['why']}")
-            transforms = torch.cat([transforms[: part["part"]], transforms[part["part"] + 1 :]])
-        types, record.labels, record.before = refined.types, refined.labels, transforms
-        record.after = transforms = refined.transforms
-        if len(types):
-            record.polish = single_ways(states, refined, views, config.polish, stacks, **options)
-            measure(record, judge, refined, level)
+        refined, labels, left = _founded(record, judge, refined, labels, config, level)
+        notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
+        types, transforms = refined.types, refined.transforms
     options["backend"] = twin_backend or backend
     gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
     twin = assemble(gaussians, labels, types, transforms, time, similarity, [e.confidence for e in record.evidence])
@@ -193,6 +189,28 @@ def _refined(judge: Judge, motions: PartMotions, axes: Tensor, config: FinishCon
         refined = settle_types(judge, refined, config.prismatic_below, config.freedom_penalty)
     refined, laid = lay_axes(judge, refined, config.askew)
     return keep_shared(judge, refined, axes), laid
+
+
+def _founded(
+    record: FinishRecord, judge: Judge, motions: PartMotions, labels: Tensor, config: FinishConfig, level: int
+) -> tuple[PartMotions, Tensor, list[tuple[int, str]]]:
+    """The parts that are worth being ones and whose motion photographs tell: their motions, the twin's labels [N], slot
+    and reason of each that vanished; ``record`` says what was measured of them."""
+    left: list[tuple[int, str]] = []
+    motions, labels, gone = drop_needless(judge, motions, labels, config.part_penalty)
+    while True:
+        for part in gone:
+            left.append((record.slots.pop(part["part"]), f"vanished: {part['why']}"))
+            record.before = torch.cat([record.before[: part["part"]], record.before[part["part"] + 1 :]])
+        record.labels, record.after, record.polish, record.evidence = motions.labels, motions.transforms, {}, []
+        if len(motions):
+            options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
+            record.polish = single_ways(judge.states, motions, judge.views, config.polish, judge.stacks, **options)
+            measure(record, judge, motions, level)
+        trust = [e.confidence for e in record.evidence]
+        motions, labels, gone = drop_untold(judge, motions, labels, trust, config.min_confidence)
+        if not gone:
+            return motions, labels, left
 
 
 def assemble(

@@ -70,6 +70,20 @@ def drop_needless(
     return judge.improved(fewer)[2] if gone else motions, labels, gone
 
 
+def drop_untold(
+    judge: Judge, motions: PartMotions, labels: Tensor, trust: list[float], least: float
+) -> tuple[PartMotions, Tensor, list[dict]]:
+    """The motions and the twin's labels [N] without the part of least confidence where that is below ``least``, the
+    rest refined again; and, if it went, which it was and a sentence ``why``. trust: of each part, as the final motions
+    were measured."""
+    if not trust or min(trust) >= least:
+        return motions, labels, []
+    part = trust.index(min(trust))
+    why = f"photographs do not tell its motion (confidence {trust[part]:.2f})"
+    fewer = without_part(motions, part, 0)
+    return judge.improved(fewer)[2], renumbering(len(motions), part, 0)[labels], [{"part": part, "why": why}]
+
+
 def own_shares(judge: Judge, motions: PartMotions) -> list[float]:
     """Of each part, what it saves of the image loss in its own pixels (``Judge.own_share``) against being static or one
     with a part that it touches, whichever explains them best."""
