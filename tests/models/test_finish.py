@@ -17,7 +17,7 @@ from p2gs.motion.joint_confidence import state_depth
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3
-from p2gs.parts.part_choices import drop_needless, join_twins, simplify, without_part
+from p2gs.parts.part_choices import drop_needless, drop_untold, join_twins, simplify, without_part
 from p2gs.types import GaussianTensors, Similarity
 
 
@@ -152,6 +152,18 @@ def test_a_part_that_saves_less_than_a_part_must_becomes_its_neighbours(one, lef
     assert len(drop_needless(judge, motions, cut, 0.0)[0]) == 2  # switched off
 
 
+def test_the_part_that_photographs_tell_least_of_goes():
+    states, labels, _ = two_states(hinge())
+    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
+    margins = [torch.ones(len(cut))] * 2
+    motions = PartMotions(["revolute"] * 2, torch.stack([hinge(), hinge()]), torch.ones(2), [cut, cut], margins)
+    judge = Told(states, cut > 0, 1.0, PolishConfig())
+    assert drop_untold(judge, motions, cut, [0.5, 0.02], 0.02) == (motions, cut, [])
+    kept, relabelled, (gone,) = drop_untold(judge, motions, cut, [0.5, 0.01], 0.02)
+    assert len(kept) == 1 and gone["part"] == 1 and "0.01" in gone["why"]
+    assert torch.equal(relabelled, torch.where(cut == 2, 0, cut)) and torch.equal(kept.labels[0], relabelled)
+
+
 def test_touching_parts_of_one_motion_are_joined_and_others_stay():
     states, labels, _ = two_states(slide())
     cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
@@ -193,14 +205,15 @@ def test_empty_and_unmoving_slots_vanish_with_a_word():
 
 
 def test_a_drawer_of_a_row_stays_though_photographs_hardly_need_it():
-    """Its front is shut and plain; that it goes the row's way is no accident."""
+    """Its front is shut and plain; that it goes the row's way is no accident. If they do not need it at all, it goes."""
     states, labels, _ = two_states(slide())
     cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
     further = slide()
     further[:3, 3] *= 1.3
     margins = [torch.ones(len(cut))] * 2
     row = PartMotions(["prismatic"] * 2, torch.stack([slide(), further]), torch.ones(2), [cut, cut], margins)
-    assert len(drop_needless(Told(states, cut > 0, 0.99, PolishConfig()), row, cut, 0.02)[0]) == 2
+    for one, left in ((1.005, 2), (0.99, 1)):  # with it the loss is 1
+        assert len(drop_needless(Told(states, cut > 0, one, PolishConfig()), row, cut, 0.02)[0]) == left
     askew = further.clone()
     askew[:3, 3] += torch.linalg.norm(further[:3, 3]) * 0.05 * torch.tensor([0.0, 0.0, 1.0])
     two = PartMotions(["prismatic"] * 2, torch.stack([slide(), askew]), torch.ones(2), [cut, cut], margins)
