@@ -144,7 +144,7 @@ def finish(
         judge = Judge(None, states, views, config.polish, stacks, **options)
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         refined, record.laid = _refined(judge, motions, axes, config)
-        refined, labels, left = _founded(record, judge, refined, labels, config, level)
+        refined, labels, left = _founded(record, judge, refined, labels, axes, config, level)
         notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
         types, transforms = refined.types, refined.transforms
     options["backend"] = twin_backend or backend
@@ -192,16 +192,24 @@ def _refined(judge: Judge, motions: PartMotions, axes: Tensor, config: FinishCon
 
 
 def _founded(
-    record: FinishRecord, judge: Judge, motions: PartMotions, labels: Tensor, config: FinishConfig, level: int
+    record: FinishRecord,
+    judge: Judge,
+    motions: PartMotions,
+    labels: Tensor,
+    axes: Tensor,
+    config: FinishConfig,
+    level: int,
 ) -> tuple[PartMotions, Tensor, list[tuple[int, str]]]:
     """The parts that are worth being ones and whose motion photographs tell: their motions, the twin's labels [N], slot
-    and reason of each that vanished; ``record`` says what was measured of them."""
+    and reason of each that vanished; ``record`` says what was measured of them. axes [K, 3]: as for ``_refined``."""
     left: list[tuple[int, str]] = []
     motions, labels, gone = drop_needless(judge, motions, labels, config.part_penalty)
     while True:
         for part in gone:
             left.append((record.slots.pop(part["part"]), f"vanished: {part['why']}"))
-            record.before = torch.cat([record.before[: part["part"]], record.before[part["part"] + 1 :]])
+            others = torch.arange(len(axes)) != part["part"]
+            record.before, axes = record.before[others], axes[others]
+        motions = keep_shared(judge, motions, axes) if gone else motions
         record.labels, record.after, record.polish, record.evidence = motions.labels, motions.transforms, {}, []
         if len(motions):
             options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}

@@ -47,17 +47,17 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
 
 
 def keep_shared(judge: Judge, motions: PartMotions, axes: Tensor) -> PartMotions:
-    """The motions with each slide that photographs took farther than ``KNOWN`` from the direction ``axes`` [K, 3] that
-    it shared with others (NaN: none) laid on it again, and refined with it held. Each by itself, a shut drawer's plain
+    """The motions with the slides that shared a direction, ``axes`` [K, 3] (NaN: none), laid on it again and refined
+    with it held, if photographs took any of them farther than ``KNOWN`` from it. Each by itself, a shut drawer's plain
     front hardly tells which way it went."""
-    held, laid = torch.full_like(axes, math.nan), motions
+    held, laid, strayed = torch.full_like(axes, math.nan), motions, False
     for k in (~axes.isnan().any(1)).nonzero()[:, 0].tolist():
         T = motions.transforms[k]
-        off = float((axis_of("prismatic", T).double() @ axes[k]).abs()) < math.cos(math.radians(KNOWN))
-        if motions.types[k] == "prismatic" and off:
+        if motions.types[k] == "prismatic":
             held[k] = axes[k]
             laid = laid.with_motion(k, "prismatic", turned_onto("prismatic", T, axes[k], torch.zeros(3).double()))
-    return judge.refine(laid, held) if laid is not motions else motions
+            strayed |= float((axis_of("prismatic", T).double() @ axes[k]).abs()) < math.cos(math.radians(KNOWN))
+    return judge.refine(laid, held) if strayed else motions
 
 
 def _best_laid(judge: Judge, motions: PartMotions, parts: list[int], axes: Tensor) -> tuple[float, PartMotions]:

@@ -205,7 +205,7 @@ def test_empty_and_unmoving_slots_vanish_with_a_word():
 
 
 def test_a_drawer_of_a_row_stays_though_photographs_hardly_need_it():
-    """Its front is shut and plain; that it goes the row's way is no accident. If they do not need it at all, it goes."""
+    """Its front is shut and plain; that it goes the row's way is no accident. Not needed at all, it goes."""
     states, labels, _ = two_states(slide())
     cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
     further = slide()
