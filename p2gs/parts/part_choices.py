@@ -25,8 +25,9 @@ def simplify(
 
     log: told of each part that goes: what was done, its index then, the label that its Gaussians got (numbered as
     then), its type, the share of the image loss that it saved in its own pixels, the change of the energy.  final:
-    motions are known for good. Then a part may go to any that it touches, not to the static one alone; and one that
-    shares its axis goes if it saves nothing in its own pixels: of a row's shut drawers photographs alone know little.
+    motions are known for good. Then a part may go to any that it touches, not to the static one alone; and a turn
+    about another's line goes if it saves nothing in its own pixels. A slide along another's direction stays: of a row's
+    shut drawers photographs alone know little.
     """
     tried: set[tuple] = set()
     states = judge.states
@@ -39,8 +40,8 @@ def simplify(
             if not final and judge.gain(reduced, motions) >= 0:
                 break
             alone = has_own_axis(states, motions, part) if final else lonely(states, motions, reduced, part)
-            least = judge.further if alone else 0.0
-            if done != "merge" and (alone or final) and judge.own_share(motions, reduced) < least:
+            asked = alone or (final and motions.types[part] == "revolute")
+            if done != "merge" and asked and judge.own_share(motions, reduced) < (judge.further if alone else 0.0):
                 break
         else:
             return motions
