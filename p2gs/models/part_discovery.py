@@ -161,12 +161,20 @@ def _improved(
 
 
 def _bodies(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMotions, list[dict]]:
-    """Parts that are several bodies told apart, and refined where there were any; what was done."""
-    surfaces = labelled_surfaces(judge.found, motions.transforms, motions.types)
-    motions, bodies = one_part_a_body(judge.states, motions, surfaces, limit)
-    if bodies:
-        motions = judge.improved(motions)[2]
-    return motions, [{"change": "one part a body", **b} for b in bodies]
+    """Parts that are several bodies told apart, and refined where there were any: those that a look goes between, and
+    such as only another part's surface separates where the energy falls by it; what was done."""
+    told: list[dict] = []
+    for held in (False, True):
+        surfaces = labelled_surfaces(judge.found, motions.transforms, motions.types)
+        tried, bodies = one_part_a_body(judge.states, motions, surfaces, limit, held)
+        if not bodies:
+            continue
+        tried = judge.improved(tried)[2]
+        gained = judge.gain(tried, motions)
+        told += [{"change": "one part a body", **b, "seen_between": not held, "energy": -gained} for b in bodies]
+        if not held or gained > 0:
+            motions = tried
+    return motions, told
 
 
 def labelled_surfaces(found: Discovery, transforms: Tensor, types: list[str]) -> Surfaces:

@@ -1,8 +1,9 @@
 """A part is one body: pieces of one motion are one part only where they touch or can be joined through space that
-nobody saw empty.
+nobody saw empty and no other part holds.
 
 Two flaps or drawers a hand apart that travel alike look like one motion. They are two parts, each with a motion of its
-own.
+own. Where a look goes between them they surely are. Where only another part's surface is between, it may have a slot
+that nobody saw (a slider's knob and tip), so that there two motions must explain more than one does.
 """
 
 from __future__ import annotations
@@ -65,10 +66,11 @@ def bridged(
     return not bool(closed.reshape(STOPS, -1).any(0).all())
 
 
-def bodies_of(surfaces: Surfaces, part: int, motion: Tensor) -> list[list[Tensor]]:
+def bodies_of(surfaces: Surfaces, part: int, motion: Tensor, held: bool) -> list[list[Tensor]]:
     """The bodies that a part consists of, the largest first, each as its rows of either state's points; none of fewer
     than ``FEWEST`` in a state, or than ``SMALL`` where the largest is not twice as large (what one state alone shows
-    may be anything).  motion [4, 4] start -> end.
+    may be anything).  motion [4, 4] start -> end.  held: another part's surface between two pieces parts them, too, not
+    a look that goes between them alone.
     """
     rows = [(of == part + 1).nonzero().squeeze(1) for of in surfaces.labels]
     if min(map(len, rows)) < 2 * SMALL:
@@ -84,7 +86,7 @@ def bodies_of(surfaces: Surfaces, part: int, motion: Tensor) -> list[list[Tensor
     if len(large) < 2:
         return [rows]
     rest = surfaces.points[0][surfaces.labels[0] != part + 1]
-    others = cKDTree(rest.numpy()) if len(rest) else None
+    others = cKDTree(rest.numpy()) if held and len(rest) else None
     group = {c: c for c in large}
     for i, c in enumerate(large):
         for other in large[:i]:
@@ -102,16 +104,16 @@ def bodies_of(surfaces: Surfaces, part: int, motion: Tensor) -> list[list[Tensor
 
 
 def one_part_a_body(
-    states: list[StateGaussians], motions: PartMotions, surfaces: Surfaces, limit: int
+    states: list[StateGaussians], motions: PartMotions, surfaces: Surfaces, limit: int, held: bool = False
 ) -> tuple[PartMotions, list[dict]]:
     """Each part that consists of several bodies as that many parts, at most ``limit`` in all, with the same motion to
-    begin with.
+    begin with. held: as for ``bodies_of``.
 
     Every Gaussian of the part goes to the body next to it. Returns the motions and what was split.
     """
     log: list[dict] = []
     for part in range(len(motions)):
-        bodies = bodies_of(surfaces, part, motions.transforms[part])[: limit - len(motions) + 1]
+        bodies = bodies_of(surfaces, part, motions.transforms[part], held)[: limit - len(motions) + 1]
         if len(bodies) < 2:
             continue
         labels = [of.clone() for of in motions.labels]

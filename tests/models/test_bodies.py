@@ -54,31 +54,32 @@ def test_pieces_are_what_touches():
 
 def test_plates_that_a_look_goes_between_are_two_bodies():
     ones = torch.ones(200, dtype=torch.long)
-    assert [len(r[0]) for r in bodies_of(surfaces(TWO, ones, between), 0, slide())] == [100, 100]
+    assert [len(r[0]) for r in bodies_of(surfaces(TWO, ones, between), 0, slide(), True)] == [100, 100]
 
 
 def test_plates_that_may_hang_together_unseen_are_one():
     ones = torch.ones(200, dtype=torch.long)
-    assert [len(r[0]) for r in bodies_of(surfaces(TWO, ones, nowhere), 0, slide())] == [200]
+    assert [len(r[0]) for r in bodies_of(surfaces(TWO, ones, nowhere), 0, slide(), True)] == [200]
 
 
 def test_what_stands_between_parts_them():
-    """No look goes through, but another part's surface fills the gap."""
+    """No look goes through, but another part's surface fills the gap; it may have a slot."""
     wall = torch.cat([plate(0.21)])
     labels = torch.cat([torch.ones(200), torch.zeros(100)]).long()
-    assert len(bodies_of(surfaces(torch.cat([TWO, wall]), labels, nowhere), 0, slide())) == 2
+    both = surfaces(torch.cat([TWO, wall]), labels, nowhere)
+    assert [len(bodies_of(both, 0, slide(), held)) for held in (True, False)] == [2, 1]
 
 
 def test_two_like_bodies_of_a_small_part_are_two():
     """Latches of a box: a dozen points each."""
     small = torch.cat([plate(0.0)[: FEWEST - 5], plate(0.4)[: FEWEST - 8]])
     ones = torch.ones(len(small), dtype=torch.long)
-    assert [len(r[0]) for r in bodies_of(surfaces(small, ones, between), 0, slide())] == [FEWEST - 5, FEWEST - 8]
+    assert [len(r[0]) for r in bodies_of(surfaces(small, ones, between), 0, slide(), True)] == [FEWEST - 5, FEWEST - 8]
 
 
 def test_crumbs_are_no_bodies():
     few = torch.cat([plate(0.0), plate(0.4)[: FEWEST - 1]])
-    rows = bodies_of(surfaces(few, torch.ones(len(few), dtype=torch.long), between), 0, slide())
+    rows = bodies_of(surfaces(few, torch.ones(len(few), dtype=torch.long), between), 0, slide(), True)
     assert len(rows) == 1 and len(rows[0][0]) == len(few)
 
 
