@@ -45,7 +45,7 @@ class FinishStage(Stage):
 
         config, found_in, states = section.config, states, sharpened or states
         if run.exact:
-            config = replace(config, part_penalty=0.0)  # as many slots as were asked for
+            config = replace(config, part_penalty=0.0, min_confidence=0.0)  # as many slots as were asked for
         backend = {"backend": run.backend, "twin_backend": run.rasterizer, "device": run.device}
         losses = run.losses("articulation")
         obj, notes, record = finish(
