@@ -164,8 +164,8 @@ def _bodies(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMotions
     """Parts that are several bodies told apart, and refined where there were any: those that a look goes between, and
     such as only another part's surface separates where the energy falls by it; what was done."""
     told: list[dict] = []
+    surfaces = labelled_surfaces(judge.found, motions.transforms, motions.types)
     for held in (False, True):
-        surfaces = labelled_surfaces(judge.found, motions.transforms, motions.types)
         tried, bodies = one_part_a_body(judge.states, motions, surfaces, limit, held)
         if not bodies:
             continue
@@ -173,7 +173,7 @@ def _bodies(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMotions
         gained = judge.gain(tried, motions)
         told += [{"change": "one part a body", **b, "seen_between": not held, "energy": -gained} for b in bodies]
         if not held or gained > 0:
-            motions = tried
+            motions, surfaces = tried, labelled_surfaces(judge.found, tried.transforms, tried.types)
     return motions, told
 
 

@@ -137,14 +137,24 @@ class Told:
         return (*self(motions), motions)
 
 
+def halved(kind: str, first: torch.Tensor, second: torch.Tensor):
+    """Both states of a part that moves by ``first``, its labels, those of its halves, and the halves as two parts."""
+    states, labels, _ = two_states(first)
+    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
+    margins = [torch.ones(len(cut))] * 2
+    return (
+        states,
+        labels,
+        cut,
+        PartMotions([kind] * 2, torch.stack([first, second]), torch.ones(2), [cut, cut], margins),
+    )
+
+
 @pytest.mark.parametrize(("one", "left"), [(1.019, 1), (1.022, 2), (0.99, 1)])
 def test_a_part_that_saves_less_than_a_part_must_becomes_its_neighbours(one, left):
     """A piece of a door that moves a little unlike the rest of it; a part must save a fiftieth."""
-    states, labels, _ = two_states(hinge())
-    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
     other = se3.from_screw(torch.tensor([0.0, 0.2, 1]).double(), torch.tensor([0.4, 0.5, 0]).double(), 0.6)
-    margins = [torch.ones(len(cut))] * 2
-    motions = PartMotions(["revolute"] * 2, torch.stack([hinge(), other]), torch.ones(2), [cut, cut], margins)
+    states, labels, cut, motions = halved("revolute", hinge(), other)
     judge = Told(states, cut > 0, one, PolishConfig())
     kept, relabelled, gone = drop_needless(judge, motions, cut, 0.02)
     assert len(kept) == left and torch.equal(relabelled, labels if left == 1 else cut)
@@ -155,20 +165,14 @@ def test_a_part_that_saves_less_than_a_part_must_becomes_its_neighbours(one, lef
 @pytest.mark.parametrize(("one", "left"), [(1.005, 2), (0.99, 1)])
 def test_of_two_turns_about_one_line_one_goes_if_photographs_do_not_need_it(one, left):
     """Two doors above one another must save less than doors on lines of their own, but something."""
-    states, labels, _ = two_states(hinge())
-    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
     screw = se3.screw_parameters(hinge())
     further = se3.from_screw(screw.axis, screw.origin, 1.1 * float(screw.angle))
-    margins = [torch.ones(len(cut))] * 2
-    two = PartMotions(["revolute"] * 2, torch.stack([hinge(), further]), torch.ones(2), [cut, cut], margins)
+    states, _, cut, two = halved("revolute", hinge(), further)
     assert len(drop_needless(Told(states, cut > 0, one, PolishConfig()), two, cut, 0.02)[0]) == left
 
 
 def test_the_part_that_photographs_tell_least_of_goes():
-    states, labels, _ = two_states(hinge())
-    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
-    margins = [torch.ones(len(cut))] * 2
-    motions = PartMotions(["revolute"] * 2, torch.stack([hinge(), hinge()]), torch.ones(2), [cut, cut], margins)
+    states, _, cut, motions = halved("revolute", hinge(), hinge())
     judge = Told(states, cut > 0, 1.0, PolishConfig())
     assert drop_untold(judge, motions, cut, [0.5, 0.02], 0.02) == (motions, cut, [])
     kept, relabelled, (gone,) = drop_untold(judge, motions, cut, [0.5, 0.01], 0.02)
@@ -218,16 +222,13 @@ def test_empty_and_unmoving_slots_vanish_with_a_word():
 
 def test_a_drawer_of_a_row_stays_though_photographs_hardly_need_it():
     """Its front is shut and plain; that it goes the row's way is no accident."""
-    states, labels, _ = two_states(slide())
-    cut = torch.where((labels == 1) & (states[0].gaussians.means[:, 2] > 0.1), 2, labels)
     further = slide()
     further[:3, 3] *= 1.3
-    margins = [torch.ones(len(cut))] * 2
-    row = PartMotions(["prismatic"] * 2, torch.stack([slide(), further]), torch.ones(2), [cut, cut], margins)
+    states, _, cut, row = halved("prismatic", slide(), further)
     assert len(drop_needless(Told(states, cut > 0, 0.99, PolishConfig()), row, cut, 0.02)[0]) == 2
     askew = further.clone()
     askew[:3, 3] += torch.linalg.norm(further[:3, 3]) * 0.05 * torch.tensor([0.0, 0.0, 1.0])
-    two = PartMotions(["prismatic"] * 2, torch.stack([slide(), askew]), torch.ones(2), [cut, cut], margins)
+    two = replace(row, transforms=torch.stack([slide(), askew]))
     assert len(drop_needless(Told(states, cut > 0, 0.99, PolishConfig()), two, cut, 0.02)[0]) == 1
 
 
