@@ -248,6 +248,12 @@ def _finish(d: dict) -> list[str]:
     if ways:
         rows = [[k.replace("_", " "), _number(w["before"]), _number(w["after"])] for k, w in ways]
         out.append(table(["image loss", "before the polish", "after"], rows))
+    if p["together"]:
+        held, free = (_number(p["together"][k]) for k in ("held", "free"))
+        out.append(
+            f'<p class="soft">Gaussians of both states fitted once more: image loss {held} with joints held, '
+            f"{free} with joints that learn, too; the lower one counts</p>"
+        )
     if p["contents"]:
         out.append(
             f'<p class="soft">{p["contents"]:,} Gaussians became a drawer\'s: they are on or in its open tray</p>'

@@ -12,6 +12,7 @@ from torch import Tensor
 from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.losses.base import Loss
 from p2gs.models.joint_of import constrain, make_joint, name_types
+from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig, tune
 from p2gs.models.twin_labels import clean_labels, settle_labels, state_labels, surviving_slots
 from p2gs.motion.directions import shared_axes
@@ -32,9 +33,9 @@ class FinishConfig:
     """Options of the last stage.
 
     polish: photometric refinement of the screws with hard labels and frozen Gaussians. survey: shifts of a part within
-    its own surface that are tried after it (internal units; [] = none). tune: then the Gaussians once more, with the
-    screws frozen. min_mass: a slot with a smaller share of the solid Gaussians vanishes. min_motion: likewise one that
-    moves its points by less (internal units).
+    its own surface that are tried after it (internal units; [] = none). together: then screws and Gaussians at once, if
+    photographs prefer it. tune: the Gaussians once more, with the screws frozen. min_mass: a slot with a smaller share
+    of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
     part_penalty: share of the image loss in its own pixels that a part with an axis of its own must save against being
     static or one with a part that it touches, as in discovery (0: parts stay). min_confidence: a part of less vanishes,
     as in discovery (0: none does).
@@ -56,6 +57,7 @@ class FinishConfig:
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0))
+    together: TuneConfig = field(default_factory=TuneConfig)
     tune: TuneConfig = field(default_factory=TuneConfig)
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     min_mass: float = 0.002
@@ -84,6 +86,7 @@ class FinishRecord:
     labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the
     polish (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
     start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.
+    together: image loss with screws held and free (``fit_together``; {}: not tried).
     laid: axes that were tried along the object's directions (``lay_axes``).  slots: the learned slot of each part.
     contents: Gaussians that became a drawer's because they are on or in its tray.
     """
@@ -98,6 +101,7 @@ class FinishRecord:
     slots: list[int] = field(default_factory=list)
     contents: int = 0
     laid: list[dict] = field(default_factory=list)
+    together: dict[str, float] = field(default_factory=dict)
 
 
 def finish(
@@ -146,6 +150,12 @@ def finish(
         refined, record.laid = _refined(judge, motions, axes, config)
         refined, labels, left = _founded(record, judge, refined, labels, axes, config, level)
         notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
+        if config.polish.steps > 0:
+            how = (config.together, config.polish.ssim_lambda)
+            refined, record.together = fit_together(learned.gaussians, labels, refined, time, views, *how, **options)
+        if refined.transforms is not record.after:
+            record.after = refined.transforms
+            measure(record, judge, refined, level)
         types, transforms = refined.types, refined.transforms
     options["backend"] = twin_backend or backend
     gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)

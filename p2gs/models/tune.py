@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from p2gs.data.views import TrainingViews, view_index
+from p2gs.data.views import TargetImage, TrainingViews, view_index
 from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.splats import Splats
 from p2gs.losses.base import Loss, LossInputs, Target
@@ -33,6 +33,44 @@ class TuneConfig:
     steps: int = 900
     levels: list[int] = field(default_factory=lambda: [400])
     rates: SplatRates = field(default_factory=lambda: SplatRates(3e-4, 4e-6, 2e-2, 1.2e-1, 3e-3, 1e-2, 2e-3))
+
+
+class TwinSteps:
+    """What every fit of the twin's Gaussians does in a step, beside its loss: the states in turn, their photographs in
+    an order of the seed's on any background, rates that fall. gains: learned at the rate of colours, if any are."""
+
+    def __init__(
+        self,
+        splats: Splats,
+        views: dict[int, TrainingViews],
+        config: TuneConfig,
+        seed: int,
+        gains: Tensor | None = None,
+    ):
+        self.views, self.config, self.seed = views, config, seed
+        learned = {name: getattr(splats, name) for name in config.rates.at(0.0)}
+        if gains is not None:
+            learned["gains"] = gains
+        self.optimizer = NamedAdam([{"params": [p], "name": name} for name, p in learned.items()], eps=1e-15)
+
+    def shot(self, step: int) -> tuple[int, TargetImage, Tensor]:
+        """The state (0 or 1), its photograph and the background [3] of this step; sets the rates."""
+        rates = self.config.rates.at(step / self.config.steps)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rates["sh0" if group["name"] == "gains" else group["name"]]
+        state = step % 2
+        of, background = self.views[state], torch.rand(3, generator=self._generator(step))
+        number = view_index(self.seed + 7919 * state + 31, step // 2, len(of))
+        return state, of.get(number, of.levels.index(self.config.levels[-1]), background), background
+
+    def _generator(self, step: int) -> torch.Generator:
+        return torch.Generator().manual_seed(self.seed * 1_000_003 + step)
+
+    def take(self, loss: Tensor) -> None:
+        """One step of the Gaussians down the loss."""
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
 
 
 def tune(
@@ -59,22 +97,10 @@ def tune(
         return gaussians
     splats, labels = Splats(gaussians).to(device), labels.to(device)
     moves = [RigidMoves(labels, se3.screw_at(transforms, state - time).to(device)) for state in (0, 1)]
-    rates = config.rates.at(0.0)
-    optimizer = NamedAdam(
-        [{"params": [getattr(splats, name)], "lr": rate, "name": name} for name, rate in rates.items()], eps=1e-15
-    )
-    cache: dict = {}
+    steps, cache = TwinSteps(splats, views, config, seed), {}
 
     def one_step(step: int) -> None:
-        state = step % 2
-        rates = config.rates.at(step / config.steps)
-        for group in optimizer.param_groups:
-            group["lr"] = rates[group["name"]]
-        of = views[state]
-        background = torch.rand(3, generator=torch.Generator().manual_seed(seed * 1_000_003 + step))
-        shot = of.get(
-            view_index(seed + 7919 * state + 31, step // 2, len(of)), of.levels.index(config.levels[-1]), background
-        )
+        state, shot, background = steps.shot(step)
         depth = None if shot.depth is None else shot.depth.to(device)
         camera, background = shot.camera.to(device), background.to(device)
         target = Target(shot.image.to(device), shot.alpha.to(device), background, depth)
@@ -86,10 +112,8 @@ def tune(
         values = [value for value in (loss(inputs) for loss in losses.values()) if value is not None]
         if not values:  # none is due in this step
             return
-        optimizer.zero_grad(set_to_none=True)
         total: Any = sum(values)
-        total.backward()
-        optimizer.step()
+        steps.take(total)
 
     with serial_torch(draws_natively(splats.means, backend)):
         for step in range(config.steps):

@@ -138,6 +138,43 @@ def apply_step(T: Tensor, centre: Tensor, radius: Tensor | float, step: Tensor) 
     return se3.make(R, centre - (R @ centre[..., None])[..., 0] + step[..., 3:]) @ T
 
 
+class MotionSteps:
+    """Adam (arXiv:1412.6980) on rigid part motions of given types.
+
+    types: "revolute" | "prismatic" | "free" per part.  radius [K]: spread of each part's points.  rate: step size at
+    the start in units of displacement at that radius; falls to a hundredth.  axes [K, 3]: directions that joints keep
+    (NaN: free; None: all are).
+    """
+
+    def __init__(self, types: list[str], radius: Tensor, rate: float, axes: Tensor | None = None):
+        self.types, self.radius, self.rate, self.axes = types, radius[:, None], rate, axes
+        self.slides = torch.tensor([kind == "prismatic" for kind in types])
+        self.first, self.second = torch.zeros(len(types), 6).double(), torch.zeros(len(types), 6).double()
+        self.taken = torch.zeros(len(types), 1)
+
+    def take(self, transforms: Tensor, gradient: Tensor, centre: Tensor, fraction: float, on: Tensor) -> Tensor:
+        """The motions [K, 4, 4] after a step. gradient [K, 6]: by rotation about ``centre`` [K, 3] and by translation.
+        fraction: how much of the descent is done.  on [K] bool: which parts have a say."""
+        gradient = torch.cat([gradient[:, :3] / self.radius, gradient[:, 3:]], 1)
+        on = on[:, None]
+        self.taken = self.taken + on
+        self.first = torch.where(on, 0.9 * self.first + 0.1 * gradient, self.first)
+        self.second = torch.where(on, 0.99 * self.second + 0.01 * gradient * gradient, self.second)
+        seen = self.taken.clamp_min(1)
+        direction = self.first / (1 - 0.9**seen) / ((self.second / (1 - 0.99**seen)).sqrt() + 1e-12)
+        rate = self.rate * exponential(1.0, 0.01, fraction)
+        delta = allowed_step(self.types, transforms, centre, self.radius[:, 0], -rate * direction)
+        delta = delta if self.axes is None else along_axes(self.types, self.axes, delta)
+        transforms = torch.where(on[..., None], apply_step(transforms, centre, self.radius, delta), transforms)
+        transforms[self.slides, :3, :3] = torch.eye(3, dtype=torch.float64)
+        return transforms
+
+    def ended(self, transforms: Tensor) -> Tensor:
+        """The motions without what pitch the last steps left to turns."""
+        of_type = zip(self.types, transforms, strict=True)
+        return torch.stack([se3.project_revolute(T) if kind == "revolute" else T for kind, T in of_type])
+
+
 @dataclass
 class Side:
     """Frozen Gaussians of one state, labels [N] (part of each, -1 leaves it out) and the other state's photographs.
@@ -187,10 +224,8 @@ def polish(
         bodies.append(MovedGaussians(side.gaussians, labels, device))
         fronts.append(None if side.seen_from is None else side.seen_from[labels >= 0].to(device))
     enough = [torch.bincount(body.labels, minlength=len(types) + 1)[1:].cpu() >= FEWEST for body in bodies]
-    slides = torch.tensor([kind == "prismatic" for kind in types])
     anchors, radius = _anchors(sides, bodies, transforms)
-    first, second = torch.zeros(len(transforms), 6).double(), torch.zeros(len(transforms), 6).double()
-    taken = torch.zeros(len(transforms), 1)
+    steps = MotionSteps(types, radius, config.rate, axes)
     losses: list[list[float]] = [[] for _ in sides]
     total = config.steps * len(sides)
     for step in range(total):
@@ -222,21 +257,8 @@ def polish(
         gradient = part_pulls(means, quats, body.bodies, anchors if side.back else centre, limit)
         if side.back:
             gradient = -torch.cat([(transforms[:, :3, :3] @ g[..., None])[..., 0] for g in gradient.split(3, 1)], 1)
-        gradient[:, :3] /= radius[:, None]
-        on = enough[turn][:, None]
-        taken = taken + on
-        first = torch.where(on, 0.9 * first + 0.1 * gradient, first)
-        second = torch.where(on, 0.99 * second + 0.01 * gradient * gradient, second)
-        seen = taken.clamp_min(1)
-        direction = first / (1 - 0.9**seen) / ((second / (1 - 0.99**seen)).sqrt() + 1e-12)
-        rate = config.rate * exponential(1.0, 0.01, fraction)
-        delta = allowed_step(types, transforms, centre, radius, -rate * direction)
-        delta = delta if axes is None else along_axes(types, axes, delta)
-        transforms = torch.where(on[..., None], apply_step(transforms, centre, radius[:, None], delta), transforms)
-        transforms[slides, :3, :3] = torch.eye(3, dtype=torch.float64)
-    for k, kind in enumerate(types):
-        if kind == "revolute":
-            transforms[k] = se3.project_revolute(transforms[k])  # what pitch the last steps left
+        transforms = steps.take(transforms, gradient, centre, fraction, enough[turn])
+    transforms = steps.ended(transforms)
     last = [of[-max(config.steps // 10, 1) :] for of in losses]
     return transforms, [sum(of) / len(of) for of in last]
 

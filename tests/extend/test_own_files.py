@@ -84,7 +84,7 @@ phases:
   canonical_fusion: {steps: 6, levels: [64], level_starts: [0.0], canonical: {match_size: 300}}
   colours: {steps: 6, levels: [64], level_starts: [0.0], losses: {render: {}}, callbacks: {joint_log: {every: 2}}}
   articulation: {steps: 6, levels: [64], level_starts: [0.0], callbacks: {joint_log: {every: 3}}}
-  finish: {polish: {steps: 8, levels: [64], level_starts: [0.0]}, tune: {steps: 4}}
+  finish: {polish: {steps: 8, levels: [64], level_starts: [0.0]}, together: {steps: 4}, tune: {steps: 4}}
 """
 
 BENCH = "{name: own, format: own_recipe, root: scenes, config: [preset/smoke.yaml, own.yaml], seeds: [0], threads: 1}"

@@ -13,6 +13,7 @@ from p2gs.diagnosis.page import page, write_diagnosis
 from p2gs.diagnosis.verdict import LIMITS, STAGES, lost_at, verdicts
 from p2gs.gaussians.handover import Articulation, CanonicalGaussians, PartMotions
 from p2gs.models.finish import FinishConfig, finish
+from p2gs.models.tune import TuneConfig
 from p2gs.motion.joint_confidence import JointEvidence
 from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
@@ -64,7 +65,9 @@ def small_run(found=None, polish_steps=0):
     )
     learned = Articulation(g, torch.nn.functional.one_hot(labels, 2).float(), ["revolute"], T, torch.ones(1), 0.0)
     config = FinishConfig(
-        polish=PolishConfig(steps=polish_steps, levels=[64], level_starts=[0.0], min_margin=0.1), clean_neighbours=0
+        polish=PolishConfig(steps=polish_steps, levels=[64], level_starts=[0.0], min_margin=0.1),
+        clean_neighbours=0,
+        together=TuneConfig(steps=20, levels=[64]),
     )
     twin, notes, record = finish(learned, states, views, config, Similarity(scale=2.0), seed=0, backend="auto")
     return StageResults(states, motions, states, canonical, learned, record, notes), twin, views

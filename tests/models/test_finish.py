@@ -12,6 +12,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.finish import FinishConfig, finish
 from p2gs.models.joint_of import constrain, make_joint, name_types
+from p2gs.models.tune import TuneConfig
 from p2gs.models.twin_labels import clean_labels, majority, state_labels, surviving_slots
 from p2gs.motion.joint_confidence import state_depth
 from p2gs.motion.refine_motions import Judge
@@ -248,7 +249,11 @@ def test_a_turn_that_is_a_slide_to_the_photographs_is_one(true):
         states[0].gaussians, torch.nn.functional.one_hot(labels, 2).float(), ["revolute"], T[None], torch.ones(1), 0.0
     )
     config = FinishConfig(
-        polish=PolishConfig(steps=20, levels=[64], level_starts=[0.0]), clean_neighbours=0, survey=[], askew=0.0
+        polish=PolishConfig(steps=20, levels=[64], level_starts=[0.0]),
+        clean_neighbours=0,
+        survey=[],
+        askew=0.0,
+        together=TuneConfig(steps=20, levels=[64]),
     )
     twin, _, _ = finish(learned, states, views, config, Similarity(), seed=0, backend="auto")
     assert twin.parts[1].joint.type == true

@@ -1,0 +1,118 @@
+"""Motions and the twin's Gaussians fitted together, where photographs of both states are explained better so.
+
+Against frozen Gaussians of one state (``screw_polish``) a motion is right to a few hundredths of a degree where their
+shape is; else it makes up for what is wrong with the shape, too (a plain door that photographs left a degree askew).
+Here both states' photographs answer for shape and motion at once. They tell little of so small differences, and
+Gaussians bend to whatever motion they are under: a motion is taken only if the image loss is lower than with the same
+Gaussians fitted as long under the motions as they were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from p2gs.data.views import TrainingViews
+from p2gs.gaussians.draw import render_gaussians
+from p2gs.gaussians.handover import PartMotions
+from p2gs.gaussians.pose import carry, with_static
+from p2gs.gaussians.splats import Splats
+from p2gs.models.tune import TuneConfig, TwinSteps
+from p2gs.motion.light import brighter
+from p2gs.motion.part_pull import part_pulls
+from p2gs.motion.screw_polish import MotionSteps, photometric_cost
+from p2gs.native import serial_torch
+from p2gs.ops import se3
+from p2gs.ops.carry import Parts, RigidMoves
+from p2gs.ops.ssim import l1_ssim
+from p2gs.render import draws_natively
+from p2gs.types import GaussianTensors
+
+
+def fit_together(
+    gaussians: GaussianTensors,
+    labels: Tensor,
+    motions: PartMotions,
+    time: float,
+    views: dict[int, TrainingViews],
+    config: TuneConfig,
+    ssim_lambda: float,
+    *,
+    axes: Tensor | None = None,
+    seed: int,
+    backend: str = "auto",
+    device: torch.device | str = "cpu",
+) -> tuple[PartMotions, dict[str, float]]:
+    """The motions as they were or as both states' photographs have them, and the image loss (sum of both states') with
+    either: {"held", "free"} ({} where nothing was fitted).
+
+    gaussians: at canonical ``time``, labels [N] (0 static).  views: photographs by state.  config: steps of the
+    Gaussians (0 = off); a part's motion learns at the rate of their centres.  ssim_lambda: weight of SSIM against L1.
+    axes [K, 3]: directions that joints keep (NaN: free; None: all are).
+    """
+    if config.steps <= 0 or len(motions) == 0 or len(gaussians) == 0:
+        return motions, {}
+    at_start = carry(gaussians, labels, with_static(se3.screw_at(motions.transforms, -time)))
+    options = {"axes": axes, "seed": seed, "backend": backend, "device": device}
+    _, held = _fit(at_start, labels, motions, views, config, ssim_lambda, 0.0, **options)
+    fitted, free = _fit(at_start, labels, motions, views, config, ssim_lambda, config.rates.means, **options)
+    return (fitted if free < held else motions), {"held": held, "free": free}
+
+
+def _fit(
+    g: GaussianTensors,
+    labels: Tensor,
+    motions: PartMotions,
+    views: dict[int, TrainingViews],
+    config: TuneConfig,
+    ssim_lambda: float,
+    rate: float,
+    *,
+    axes: Tensor | None,
+    seed: int,
+    backend: str,
+    device: torch.device | str,
+) -> tuple[PartMotions, float]:
+    """Motions and the loss of both states' photographs after ``config.steps`` steps; g: at the start.
+    rate: of the motions (0: they are held)."""
+    splats, labels, T = Splats(g).to(device), labels.to(device), motions.transforms.double().clone()
+    parts, some = Parts(labels), torch.ones(len(motions), dtype=torch.bool)
+    points = [g.means[labels.cpu() == k + 1].double() for k in range(len(motions))]
+    middle = torch.stack([p.mean(0) if len(p) else torch.zeros(3).double() for p in points])
+    spread = torch.stack([(p - m).square().sum(1).mean().sqrt() for p, m in zip(points, middle, strict=True)])
+    by_motion = MotionSteps(motions.types, spread.nan_to_num().clamp_min(1e-3), rate, axes)
+    turns = torch.tensor([float(kind != "prismatic") for kind in motions.types])
+    gains = torch.zeros(len(motions), requires_grad=True)  # logarithms: how much brighter the end has a part that turns
+    steps = TwinSteps(splats, views, config, seed, gains)
+
+    def one_step(step: int) -> None:
+        nonlocal T
+        state, shot, background = steps.shot(step)
+        posed = splats.tensors()
+        if state:
+            means, quats = RigidMoves(labels, T.to(device))(posed.means, posed.quats)
+            means.retain_grad()
+            quats.retain_grad()
+            posed = GaussianTensors(means, quats, posed.log_scales, posed.opacity_logits, posed.sh)
+            posed = brighter(posed, labels, (gains * turns).exp())
+        image, camera = shot.image.to(device), shot.camera.to(device)
+        out = render_gaussians(posed, camera, background.to(device), backend=backend)
+        steps.take(l1_ssim(out.colour, image, ssim_lambda))
+        if state and rate > 0:
+            centre = se3.apply(T, middle[:, None])[:, 0]
+            T = by_motion.take(T, part_pulls(means, quats, parts, centre), centre, step / config.steps, some)
+
+    with serial_torch(draws_natively(splats.means, backend)):
+        for step in range(config.steps):
+            one_step(step)
+    T = by_motion.ended(T)
+    ended, labels = splats.tensors().detach().to("cpu"), labels.cpu()
+    there = brighter(carry(ended, labels, with_static(T)), labels, (gains * turns).exp().detach())
+    options = {"level": config.levels[-1], "ssim_lambda": ssim_lambda, "backend": backend, "device": device}
+    still = torch.zeros_like(labels), torch.zeros(0, 4, 4).double()  # as they are
+    losses = [
+        photometric_cost(at, *still, views[s], count=len(views[s]), **options) for s, at in enumerate((ended, there))
+    ]
+    return replace(motions, transforms=T), sum(losses)
