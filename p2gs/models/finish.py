@@ -150,12 +150,7 @@ def finish(
         refined, record.laid = _refined(judge, motions, axes, config)
         refined, labels, left = _founded(record, judge, refined, labels, axes, config, level)
         notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
-        if config.polish.steps > 0:
-            how = (config.together, config.polish.ssim_lambda)
-            refined, record.together = fit_together(learned.gaussians, labels, refined, time, views, *how, **options)
-        if refined.transforms is not record.after:
-            record.after = refined.transforms
-            measure(record, judge, refined, level)
+        refined = _with_gaussians(record, judge, refined, learned, labels, config, level)
         types, transforms = refined.types, refined.transforms
     options["backend"] = twin_backend or backend
     gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
@@ -229,6 +224,29 @@ def _founded(
         motions, labels, gone = drop_untold(judge, motions, labels, trust, config.min_confidence)
         if not gone:
             return motions, labels, left
+
+
+def _with_gaussians(
+    record: FinishRecord,
+    judge: Judge,
+    motions: PartMotions,
+    learned: Articulation,
+    labels: Tensor,
+    config: FinishConfig,
+    level: int,
+) -> PartMotions:
+    """The motions as photographs have them when Gaussians bend with them (``fit_together``); slides of a row keep their
+    direction. labels [N]: the twin's."""
+    if config.polish.steps <= 0:
+        return motions
+    options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
+    options["axes"] = shared_axes(motions.transforms, motions.types)
+    g, time, lambda_ = learned.gaussians, learned.canonical_time, config.polish.ssim_lambda
+    fitted, record.together = fit_together(g, labels, motions, time, judge.views, config.together, lambda_, **options)
+    if fitted is not motions:
+        record.after = fitted.transforms
+        measure(record, judge, fitted, level)
+    return fitted
 
 
 def assemble(
