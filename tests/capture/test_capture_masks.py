@@ -122,6 +122,17 @@ def test_sharpening_moves_an_edge_to_the_picture_and_not_further():
     assert (sharpened(flat, share) != (share > 0.5)).sum() <= 0.15 * share.sum()
 
 
+def test_a_leg_thinner_than_the_band_stays_though_it_is_coloured_like_the_floor():
+    rng = np.random.default_rng(0)
+    image = np.full((200, 240, 3), 90, np.uint8) + rng.integers(0, 12, (200, 240, 3)).astype(np.uint8)
+    image[30:80, 40:200] += 120  # a table's top; its leg is as the floor
+    share = np.zeros((200, 240))
+    share[30:80, 40:200] = share[80:180, 60:64] = 1
+    cut = sharpened(image, share)
+    assert cut[90:170, 61:63].mean() > 0.95
+    assert (cut != (share > 0.5)).sum() < 0.02 * share.sum()
+
+
 def test_a_mask_goes_back_through_the_lens():
     lens = Lens("OPENCV", 320, 240, np.array([260.0, 260, 160, 120, -0.08, 0.01, 0, 0]))
     from p2gs.data.capture.write import pinhole_of

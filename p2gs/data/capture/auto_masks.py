@@ -52,8 +52,8 @@ def band(shape: tuple[int, ...]) -> int:
 
 
 def sharpened(image: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """[h, w] bool: the object by GrabCut in a band around the edge of ``share`` [h, w] float (what the splat says).
-    image: uint8 RGB."""
+    """[h, w] bool: the object by GrabCut in a band around the edge of ``share`` [h, w] float (what the splat says);
+    what is thinner than the band stays as drawn, for nothing in it is sure. image: uint8 RGB."""
     import cv2
 
     drawn = (share > 0.5).astype(np.uint8)
@@ -74,7 +74,7 @@ def sharpened(image: np.ndarray, share: np.ndarray) -> np.ndarray:
         3,
         cv2.GC_INIT_WITH_MASK,
     )
-    cut = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+    cut = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD) | (drawn > cv2.dilate(inner, kernel))
     return drawn > 0 if (cut != (drawn > 0)).sum() > CHANGED * drawn.sum() else cut
 
 
