@@ -10,6 +10,7 @@ Gaussians fitted as long under the motions as they were.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ from p2gs.models.tune import TuneConfig, TwinSteps
 from p2gs.motion.light import brighter
 from p2gs.motion.part_pull import part_pulls
 from p2gs.motion.screw_polish import MotionSteps, photometric_cost
-from p2gs.native import serial_torch
+from p2gs.native import at_once, serial_torch
 from p2gs.ops import se3
 from p2gs.ops.carry import Parts, RigidMoves
 from p2gs.ops.ssim import l1_ssim
@@ -56,8 +57,8 @@ def fit_together(
         return motions, {}
     at_start = carry(gaussians, labels, with_static(se3.screw_at(motions.transforms, -time)))
     options = {"axes": axes, "seed": seed, "backend": backend, "device": device}
-    _, held = _fit(at_start, labels, motions, views, config, ssim_lambda, 0.0, **options)
-    fitted, free = _fit(at_start, labels, motions, views, config, ssim_lambda, config.rates.means, **options)
+    fit = partial(_fit, at_start, labels, motions, views, config, ssim_lambda, **options)
+    (_, held), (fitted, free) = at_once(fit, (0.0, config.rates.means))
     return (fitted if free < held else motions), {"held": held, "free": free}
 
 
