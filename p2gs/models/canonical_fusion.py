@@ -18,7 +18,7 @@ from p2gs.models.canonical import CanonicalConfig, fuse, keep_rows
 from p2gs.models.phase import register_phase
 from p2gs.models.single_state import ImageConfig, ImagePhase, SplatRates
 from p2gs.ops import se3
-from p2gs.ops.carry import RigidMoves
+from p2gs.ops.carry import Parts, RigidMoves
 from p2gs.parts.owners import hidden_to_owners
 from p2gs.surface.openings import OpeningsConfig, open_up
 from p2gs.types import GaussianTensors
@@ -135,9 +135,8 @@ class CanonicalFusionPhase(ImagePhase):
         if hasattr(self.splats, "offsets"):
             return g.placed(g.means + self.splats.offsets[:, state], g.quats)
         if self.moves is None:
-            self.moves = [
-                RigidMoves(self.splats.labels, se3.screw_at(self.transforms, s - (1 - self.betas[1:]))) for s in (0, 1)
-            ]
+            parts = Parts(self.splats.labels)
+            self.moves = [RigidMoves(parts, se3.screw_at(self.transforms, s - (1 - self.betas[1:]))) for s in (0, 1)]
         return g.placed(*self.moves[state](g.means, g.quats))
 
     def inputs(self, visit: Visit) -> LossInputs:

@@ -23,10 +23,10 @@ from p2gs.gaussians.splats import Splats
 from p2gs.models.tune import TuneConfig, TwinSteps
 from p2gs.motion.light import brighter
 from p2gs.motion.part_pull import part_pulls
-from p2gs.motion.screw_polish import MotionSteps, photometric_cost
+from p2gs.motion.screw_polish import MotionSteps, MovedGaussians, Side, anchors_of, photometric_cost
 from p2gs.native import at_once, serial_torch
 from p2gs.ops import se3
-from p2gs.ops.carry import Parts, RigidMoves
+from p2gs.ops.carry import RigidMoves
 from p2gs.ops.ssim import l1_ssim
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
@@ -78,12 +78,11 @@ def _fit(
 ) -> tuple[PartMotions, float]:
     """Motions and the loss of both states' photographs after ``config.steps`` steps; g: at the start.
     rate: of the motions (0: they are held)."""
-    splats, labels, T = Splats(g).to(device), labels.to(device), motions.transforms.double().clone()
-    parts, some = Parts(labels), torch.ones(len(motions), dtype=torch.bool)
-    points = [g.means[labels.cpu() == k + 1].double() for k in range(len(motions))]
-    middle = torch.stack([p.mean(0) if len(p) else torch.zeros(3).double() for p in points])
-    spread = torch.stack([(p - m).square().sum(1).mean().sqrt() for p, m in zip(points, middle, strict=True)])
-    by_motion = MotionSteps(motions.types, spread.nan_to_num().clamp_min(1e-3), rate, axes)
+    splats, T, some = Splats(g).to(device), motions.transforms.double().clone(), torch.ones(len(motions)).bool()
+    body = MovedGaussians(g, labels, device)
+    labels, parts = body.labels, body.bodies
+    middle, spread = anchors_of([Side(g, labels, views[1])], [body], T)
+    by_motion = MotionSteps(motions.types, spread, rate, axes)
     turns = torch.tensor([float(kind != "prismatic") for kind in motions.types])
     gains = torch.zeros(len(motions), requires_grad=True)  # logarithms: how much brighter the end has a part that turns
     steps = TwinSteps(splats, views, config, seed, gains)
@@ -93,7 +92,7 @@ def _fit(
         state, shot, background = steps.shot(step)
         posed = splats.tensors()
         if state:
-            means, quats = RigidMoves(labels, T.to(device))(posed.means, posed.quats)
+            means, quats = RigidMoves(parts, T.to(device))(posed.means, posed.quats)
             means.retain_grad()
             quats.retain_grad()
             posed = GaussianTensors(means, quats, posed.log_scales, posed.opacity_logits, posed.sh)

@@ -20,7 +20,7 @@ from p2gs.models.adam import NamedAdam
 from p2gs.models.single_state import SplatRates
 from p2gs.native import serial_torch
 from p2gs.ops import se3
-from p2gs.ops.carry import RigidMoves
+from p2gs.ops.carry import Parts, RigidMoves
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
 
@@ -59,12 +59,10 @@ class TwinSteps:
         for group in self.optimizer.param_groups:
             group["lr"] = rates["sh0" if group["name"] == "gains" else group["name"]]
         state = step % 2
-        of, background = self.views[state], torch.rand(3, generator=self._generator(step))
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
+        of, background = self.views[state], torch.rand(3, generator=generator)
         number = view_index(self.seed + 7919 * state + 31, step // 2, len(of))
         return state, of.get(number, of.levels.index(self.config.levels[-1]), background), background
-
-    def _generator(self, step: int) -> torch.Generator:
-        return torch.Generator().manual_seed(self.seed * 1_000_003 + step)
 
     def take(self, loss: Tensor) -> None:
         """One step of the Gaussians down the loss."""
@@ -95,8 +93,8 @@ def tune(
     losses = {name: loss for name, loss in losses.items() if loss.kind == "image"}
     if config.steps <= 0 or not losses or len(gaussians) == 0:
         return gaussians
-    splats, labels = Splats(gaussians).to(device), labels.to(device)
-    moves = [RigidMoves(labels, se3.screw_at(transforms, state - time).to(device)) for state in (0, 1)]
+    splats, parts = Splats(gaussians).to(device), Parts(labels.to(device))
+    moves = [RigidMoves(parts, se3.screw_at(transforms, state - time).to(device)) for state in (0, 1)]
     steps, cache = TwinSteps(splats, views, config, seed), {}
 
     def one_step(step: int) -> None:

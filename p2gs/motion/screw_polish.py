@@ -224,7 +224,7 @@ def polish(
         bodies.append(MovedGaussians(side.gaussians, labels, device))
         fronts.append(None if side.seen_from is None else side.seen_from[labels >= 0].to(device))
     enough = [torch.bincount(body.labels, minlength=len(types) + 1)[1:].cpu() >= FEWEST for body in bodies]
-    anchors, radius = _anchors(sides, bodies, transforms)
+    anchors, radius = anchors_of(sides, bodies, transforms)
     steps = MotionSteps(types, radius, config.rate, axes)
     losses: list[list[float]] = [[] for _ in sides]
     total = config.steps * len(sides)
@@ -263,7 +263,7 @@ def polish(
     return transforms, [sum(of) / len(of) for of in last]
 
 
-def _anchors(sides, bodies, transforms: Tensor) -> tuple[Tensor, Tensor]:
+def anchors_of(sides, bodies, transforms: Tensor) -> tuple[Tensor, Tensor]:
     """Each part's centre at the start [K-1, 3] and the spread of its points [K-1] (float64, CPU), means over the
     sides."""
     anchors, radius = [], []

@@ -80,16 +80,16 @@ def carry_reference(
 class RigidMoves:
     """Motions that stay, for Gaussians that learn: like ``carry`` without harmonics, with gradients by means and quats.
 
-    labels [N] int64; transforms [K-1, 4, 4], part k moves by transforms[k-1].
+    parts: of N Gaussians; transforms [K-1, 4, 4], part k moves by transforms[k-1].
     """
 
-    def __init__(self, labels: Tensor, transforms: Tensor):
-        self.parts, self.transforms = Parts(labels), transforms
+    def __init__(self, parts: Parts, transforms: Tensor):
+        self.parts, self.transforms = parts, transforms
         self.back = torch.eye(4, dtype=transforms.dtype, device=transforms.device).expand_as(transforms).clone()
         self.back[:, :3, :3] = transforms[:, :3, :3].transpose(1, 2)
         # q and -q turn alike, but a gradient by q knows which it was: of a half turn the inverse may come out as the
         # other one
-        still = torch.zeros(len(labels), 4).to(labels.device)
+        still = torch.zeros(len(parts.labels), 4).to(parts.labels.device)
         still[:, 0] = 1
         there = carry(still[:, 1:], still, still[:, None, 1:], self.parts, transforms)[1]
         again = carry(still[:, 1:], there, still[:, None, 1:], self.parts, self.back)[1]
