@@ -80,10 +80,11 @@ def carry_reference(
 class RigidMoves:
     """Motions that stay, for Gaussians that learn: like ``carry`` without harmonics, with gradients by means and quats.
 
-    parts: of N Gaussians; transforms [K-1, 4, 4], part k moves by transforms[k-1].
+    labels [N] int64, or what ``Parts`` has sorted them into; transforms [K-1, 4, 4], part k moves by transforms[k-1].
     """
 
-    def __init__(self, parts: Parts, transforms: Tensor):
+    def __init__(self, labels: Tensor | Parts, transforms: Tensor):
+        parts = labels if isinstance(labels, Parts) else Parts(labels)
         self.parts, self.transforms = parts, transforms
         self.back = torch.eye(4, dtype=transforms.dtype, device=transforms.device).expand_as(transforms).clone()
         self.back[:, :3, :3] = transforms[:, :3, :3].transpose(1, 2)

@@ -109,7 +109,7 @@ def test_moves_with_gradients(isa, half_turns):
         g = carry_in_torch(GaussianTensors(m, q, m, m[:, 0], m[:, None]), labels, with_static(transforms))
         return g.means, g.quats * q.detach().norm(dim=1, keepdim=True)
 
-    ours, exact = run(RigidMoves(Parts(labels), transforms), torch.float32), run(slow, torch.float64)
+    ours, exact = run(RigidMoves(labels, transforms), torch.float32), run(slow, torch.float64)
     for a, b in list(zip(ours, exact, strict=True))[:3]:
         assert torch.allclose(a.double(), b, atol=1e-5)
     # the slow way also normalises: compare what is left of the gradient across q
