@@ -240,7 +240,8 @@ def _with_gaussians(
     if config.polish.steps <= 0:
         return motions
     options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
-    options["axes"] = shared_axes(motions.transforms, motions.types)
+    options |= {"axes": shared_axes(motions.transforms, motions.types), "tau": config.polish.free_static}
+    options["stacks"] = judge.stacks if config.polish.free_static > 0 else None
     g, time, lambda_ = learned.gaussians, learned.canonical_time, config.polish.ssim_lambda
     fitted, record.together = fit_together(g, labels, motions, time, judge.views, config.together, lambda_, **options)
     if fitted is not motions:

@@ -21,7 +21,7 @@ from p2gs.gaussians.handover import PartMotions
 from p2gs.gaussians.pose import carry, with_static
 from p2gs.gaussians.splats import Splats
 from p2gs.models.tune import TuneConfig, TwinSteps
-from p2gs.motion.light import brighter
+from p2gs.motion.light import TurnedLight, brighter, facing_either
 from p2gs.motion.part_pull import part_pulls
 from p2gs.motion.screw_polish import MotionSteps, MovedGaussians, Side, anchors_of, photometric_cost
 from p2gs.native import at_once, serial_torch
@@ -30,6 +30,7 @@ from p2gs.ops.carry import RigidMoves
 from p2gs.ops.ssim import l1_ssim
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
+from p2gs.visibility.depth_stack import DepthStack
 
 
 def fit_together(
@@ -42,6 +43,8 @@ def fit_together(
     ssim_lambda: float,
     *,
     axes: Tensor | None = None,
+    stacks: list[DepthStack] | None = None,
+    tau: float = 0.02,
     seed: int,
     backend: str = "auto",
     device: torch.device | str = "cpu",
@@ -51,12 +54,16 @@ def fit_together(
 
     gaussians: at canonical ``time``, labels [N] (0 static).  views: photographs by state.  config: steps of the
     Gaussians (0 = off); a part's motion learns at the rate of their centres.  ssim_lambda: weight of SSIM against L1.
-    axes [K, 3]: directions that joints keep (NaN: free; None: all are).
+    axes [K, 3]: directions that joints keep (NaN: free; None: all are).  stacks: rendered depth of both states, by
+    which Gaussians face those who see them on a surface, to within ``tau`` (None: a part's sides are lit alike).
     """
     if config.steps <= 0 or len(motions) == 0 or len(gaussians) == 0:
         return motions, {}
     at_start = carry(gaussians, labels, with_static(se3.screw_at(motions.transforms, -time)))
-    options = {"axes": axes, "seed": seed, "backend": backend, "device": device}
+    normals = torch.zeros_like(at_start.means)
+    if stacks is not None:
+        normals = facing_either(at_start, labels, motions.transforms, stacks, tau)
+    options = {"axes": axes, "normals": normals, "seed": seed, "backend": backend, "device": device}
     fit = partial(_fit, at_start, labels, motions, views, config, ssim_lambda, **options)
     (_, held), (fitted, free) = at_once(fit, (0.0, config.rates.means))
     return (fitted if free < held else motions), {"held": held, "free": free}
@@ -72,20 +79,24 @@ def _fit(
     rate: float,
     *,
     axes: Tensor | None,
+    normals: Tensor,
     seed: int,
     backend: str,
     device: torch.device | str,
 ) -> tuple[PartMotions, float]:
     """Motions and the loss of both states' photographs after ``config.steps`` steps; g: at the start.
-    rate: of the motions (0: they are held)."""
+    rate: of the motions (0: they are held).  normals [N, 3]: which way Gaussians face at the start (0: not known)."""
     splats, T, some = Splats(g).to(device), motions.transforms.double().clone(), torch.ones(len(motions)).bool()
     body = MovedGaussians(g, labels, device)
     labels, parts = body.labels, body.bodies
     middle, spread = anchors_of([Side(g, labels, views[1])], [body], T)
     by_motion = MotionSteps(motions.types, spread, rate, axes)
-    turns = torch.tensor([float(kind != "prismatic") for kind in motions.types])
-    gains = torch.zeros(len(motions), requires_grad=True)  # logarithms: how much brighter the end has a part that turns
-    steps = TwinSteps(splats, views, config, seed, gains)
+    turns = torch.tensor([float(kind != "prismatic") for kind in motions.types])[:, None].to(device)
+    light, normals = torch.zeros(len(motions), 4, device=device, requires_grad=True), normals.to(device)
+    steps = TwinSteps(splats, views, config, seed, light)
+
+    def gains() -> Tensor:
+        return TurnedLight(light * turns).gains(labels, normals)
 
     def one_step(step: int) -> None:
         nonlocal T
@@ -96,7 +107,7 @@ def _fit(
             means.retain_grad()
             quats.retain_grad()
             posed = GaussianTensors(means, quats, posed.log_scales, posed.opacity_logits, posed.sh)
-            posed = brighter(posed, labels, (gains * turns).exp())
+            posed = brighter(posed, gains())
         image, camera = shot.image.to(device), shot.camera.to(device)
         out = render_gaussians(posed, camera, background.to(device), backend=backend)
         steps.take(l1_ssim(out.colour, image, ssim_lambda))
@@ -108,8 +119,8 @@ def _fit(
         for step in range(config.steps):
             one_step(step)
     T = by_motion.ended(T)
-    ended, labels = splats.tensors().detach().to("cpu"), labels.cpu()
-    there = brighter(carry(ended, labels, with_static(T)), labels, (gains * turns).exp().detach())
+    ended, gain, labels = splats.tensors().detach().to("cpu"), gains().detach().cpu(), labels.cpu()
+    there = brighter(carry(ended, labels, with_static(T)), gain)
     options = {"level": config.levels[-1], "ssim_lambda": ssim_lambda, "backend": backend, "device": device}
     still = torch.zeros_like(labels), torch.zeros(0, 4, 4).double()  # as they are
     losses = [

@@ -37,7 +37,7 @@ class TuneConfig:
 
 class TwinSteps:
     """What every fit of the twin's Gaussians does in a step, beside its loss: the states in turn, their photographs in
-    an order of the seed's on any background, rates that fall. gains: learned at the rate of colours, if any are."""
+    an order of the seed's on any background, rates that fall. light: learned at the rate of colours, if it is."""
 
     def __init__(
         self,
@@ -45,19 +45,19 @@ class TwinSteps:
         views: dict[int, TrainingViews],
         config: TuneConfig,
         seed: int,
-        gains: Tensor | None = None,
+        light: Tensor | None = None,
     ):
         self.views, self.config, self.seed = views, config, seed
         learned = {name: getattr(splats, name) for name in config.rates.at(0.0)}
-        if gains is not None:
-            learned["gains"] = gains
+        if light is not None:
+            learned["light"] = light
         self.optimizer = NamedAdam([{"params": [p], "name": name} for name, p in learned.items()], eps=1e-15)
 
     def shot(self, step: int) -> tuple[int, TargetImage, Tensor]:
         """The state (0 or 1), its photograph and the background [3] of this step; sets the rates."""
         rates = self.config.rates.at(step / self.config.steps)
         for group in self.optimizer.param_groups:
-            group["lr"] = rates["sh0" if group["name"] == "gains" else group["name"]]
+            group["lr"] = rates["sh0" if group["name"] == "light" else group["name"]]
         state = step % 2
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
         of, background = self.views[state], torch.rand(3, generator=generator)

@@ -10,7 +10,7 @@ from test_agreement import grid, splats
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.agreement import kept_and_shown
-from p2gs.motion.light import FEWEST, as_lit_there, brighter, facing, turning_gains
+from p2gs.motion.light import FEWEST, as_lit_there, brighter, facing, facing_either, turned_light
 from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
 from p2gs.ops.sh import dc_to_rgb, evaluate
@@ -29,33 +29,48 @@ def plates(factor: float, n: int = 200):
     return [[at, turned[0]], [way, turned[1]], [colour, factor * colour], [torch.ones(n, dtype=torch.long)] * 2]
 
 
+def gain_of(seen, T: torch.Tensor, turns: bool = True) -> float:
+    """Of a surface that faces as the plate does at the start."""
+    light = turned_light(*seen, T[None], [turns], 0.05)
+    return float(light.gains(torch.ones(1, dtype=torch.long), seen[1][0][:1]))
+
+
 @pytest.mark.parametrize("factor", [0.6, 1.7])
 def test_the_gain_is_how_much_brighter_the_end_is(factor):
-    gain = turning_gains(*plates(factor), TURN[None], [True], 0.05)
-    assert float(gain) == pytest.approx(factor, rel=1e-4)
-    back = turning_gains(*[x[::-1] for x in plates(factor)], se3.inverse(TURN)[None], [True], 0.05)
-    assert float(back) == pytest.approx(1 / factor, rel=1e-4)  # states exchanged
+    assert gain_of(plates(factor), TURN) == pytest.approx(factor, rel=1e-4)
+    exchanged = [x[::-1] for x in plates(factor)]
+    assert gain_of(exchanged, se3.inverse(TURN)) == pytest.approx(1 / factor, rel=1e-4)
+
+
+def test_each_side_has_its_own_light_and_a_tenth_of_wrong_matches_does_not_matter():
+    front, back = plates(0.5), plates(1.6)
+    back = [[x + 0.02 * n for x, n in zip(back[0], back[1], strict=True)], [-n for n in back[1]], *back[2:]]
+    both = [[torch.cat(pair) for pair in zip(*sides, strict=True)] for sides in zip(front, back, strict=True)]
+    both[2][1][::10] = 0.9
+    light = turned_light(*both, TURN[None], [True], 0.01)
+    seen = light.gains(torch.ones(2, dtype=torch.long), torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
+    assert seen.tolist() == pytest.approx([0.5, 1.6], rel=0.03)
 
 
 def test_slides_other_sides_and_few_points_have_no_gain():
     seen = plates(0.6)
-    assert float(turning_gains(*seen, TURN[None], [False], 0.05)) == 1.0
+    assert gain_of(seen, TURN, turns=False) == 1.0
     turned_over = [seen[0], [seen[1][0], -seen[1][1]], *seen[2:]]
-    assert float(turning_gains(*turned_over, TURN[None], [True], 0.05)) == 1.0
+    assert gain_of(turned_over, TURN) == 1.0
     few = [[x[: FEWEST // 2 - 1] for x in both] for both in seen]
-    assert float(turning_gains(*few, TURN[None], [True], 0.05)) == 1.0
+    assert gain_of(few, TURN) == 1.0
     apart = [[seen[0][0], seen[0][1] + 1.0], *seen[1:]]
-    assert float(turning_gains(*apart, TURN[None], [True], 0.05)) == 1.0
+    assert gain_of(apart, TURN) == 1.0
 
 
 def test_brighter_multiplies_the_colour_from_every_direction():
     gen = torch.Generator().manual_seed(1)
     g = splats(torch.randn(5, 3, generator=gen))
     g = replace(g, sh=0.3 * torch.randn(5, 4, 3, generator=gen))
-    labels, gains = torch.tensor([0, 1, 2, 1, -1]), torch.tensor([0.5, 2.0])
+    gains = torch.tensor([1.0, 0.5, 2.0, 0.5, 1.0])
     way = torch.nn.functional.normalize(torch.randn(5, 3, generator=gen), dim=1)
-    before, after = (evaluate(x.sh, way) for x in (g, brighter(g, labels, gains)))
-    assert torch.allclose(after, before * torch.tensor([1.0, 0.5, 2.0, 0.5, 1.0])[:, None], atol=1e-6)
+    before, after = (evaluate(x.sh, way) for x in (g, brighter(g, gains)))
+    assert torch.allclose(after, before * gains[:, None], atol=1e-6)
 
 
 def test_gaussians_face_those_who_see_them():
@@ -64,6 +79,19 @@ def test_gaussians_face_those_who_see_them():
         normal = facing(g, seen_along_x(0.0, side), CONFIG.free_static)
         assert torch.allclose(normal, torch.tensor([side, 0.0, 0.0]).expand(len(g), 3))
     assert not facing(g, seen_along_x(0.5), CONFIG.free_static).any()  # hidden behind another plane
+
+
+def test_a_twin_faces_those_who_see_it_in_either_state():
+    """Seen at the end alone, turned by a quarter."""
+    T = se3.from_screw(torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double(), -math.pi / 2)
+    g, one = splats(se3.apply(se3.inverse(T).float(), grid(0.0))), torch.ones(len(grid(0.0)), dtype=torch.long)
+    quats = torch.zeros(len(g), 4)
+    quats[:, 0] = quats[:, 3] = math.sqrt(0.5)  # a quarter about z
+    g = replace(g, quats=quats)
+    for side in (1.0, -1.0):
+        stacks = [seen_along_x(9.0), seen_along_x(0.0, side)]
+        normal = facing_either(g, one, T[None], stacks, CONFIG.free_static)
+        assert torch.allclose(normal, torch.tensor([0.0, side, 0.0]).expand(len(g), 3), atol=1e-5)
 
 
 def turned_by(angle: float, colour: float) -> tuple[list[StateGaussians], PartMotions]:

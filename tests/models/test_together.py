@@ -43,7 +43,7 @@ def test_a_part_that_is_brighter_in_the_end_is_put_right_too():
     truth = hinge()
     states, labels, _ = two_states(truth)
     g, wrong = states[0].gaussians, se3.screw_at(truth[None], 1.02)[0]
-    lit = brighter(g, labels, torch.tensor([0.7]))
+    lit = brighter(g, torch.tensor([1.0, 0.7])[labels])
     views = {
         s: TrainingViews(photographs(x, labels, T, s), [64])
         for s, (x, T) in enumerate([(g, torch.eye(4).double()), (lit, truth)])

@@ -16,7 +16,7 @@ from p2gs.motion.discovery.pool import plausibility
 from p2gs.motion.discovery.problem import Problem
 from p2gs.motion.discovery.result import Candidate, FoundMotion
 from p2gs.motion.discovery.rigid import Motions
-from p2gs.motion.discovery.verify import gains_of, violation
+from p2gs.motion.discovery.verify import light_of, violation
 from p2gs.visibility.depth_stack import StateEvidence
 
 
@@ -31,7 +31,7 @@ def describe(problem: Problem, e: Explanation, start: StateEvidence, end: StateE
 def found_motions(problem: Problem, motions: Motions, labelling: Labelling) -> list[FoundMotion]:
     """Each motion in words, with its confidence and mass under the labels."""
     found = []
-    mass, gains = masses(problem, labelling), gains_of(problem, motions, labelling)
+    mass, light = masses(problem, labelling), light_of(problem, motions, labelling)
     pays = [p for p, _ in problem.pay(motions)] if len(motions) else []
     plausible = plausibility(problem, motions, pays, problem.samples, False) if len(motions) else torch.zeros(0)
     for k in range(len(motions)):
@@ -40,7 +40,7 @@ def found_motions(problem: Problem, motions: Motions, labelling: Labelling) -> l
         mine = [labelling.labels(s) == k + 1 for s in (0, 1)]
         rows = [of.nonzero()[:, 0] for of in mine]
         agree = [
-            1 - float(violation(problem, motions, labelling, s, i, gains=gains).mean()) if len(i) else 0.0
+            1 - float(violation(problem, motions, labelling, s, i, light=light).mean()) if len(i) else 0.0
             for s, i in enumerate(rows)
         ]
         middle = problem.surfels[0].points[mine[0]].mean(0).double() if mine[0].any() else problem.centre.double()

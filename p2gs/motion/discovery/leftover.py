@@ -14,7 +14,7 @@ from p2gs.motion.discovery.proposals import as_motions, sided, stacked
 from p2gs.motion.discovery.result import Discovery
 from p2gs.motion.discovery.rigid import Motions
 from p2gs.motion.discovery.search import ExclusiveGain, Search
-from p2gs.motion.discovery.verify import gains_of, violation
+from p2gs.motion.discovery.verify import light_of, violation
 
 SETS = 2  # best sets of motions that are taken from
 
@@ -50,9 +50,9 @@ def contradicted(found: Discovery, motions: Motions) -> list[Tensor]:
     problem, out = found.problem, []
     motions = sided(problem, motions)
     labelling = label(problem, motions, found.graphs, revealed=True)
-    gains = gains_of(problem, motions, labelling)
+    light = light_of(problem, motions, labelling)
     for s, surfels in enumerate(problem.surfels):
-        cost = violation(problem, motions, labelling, s, torch.arange(len(surfels)), gains=gains)
+        cost = violation(problem, motions, labelling, s, torch.arange(len(surfels)), light=light)
         out.append(smooth_mask(surfels.points, problem.moved[s] & (cost > problem.config.unexplained)))
     return out
 

@@ -11,7 +11,7 @@ from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.discovery.labels import Labelling
 from p2gs.motion.discovery.problem import Problem
 from p2gs.motion.discovery.rigid import Motions
-from p2gs.motion.light import turning_gains
+from p2gs.motion.light import TurnedLight, turned_light
 
 WRONG = 1.0  # cost of a point that something contradicts; hidden space costs what it does where motions are searched
 NEIGHBOURS = 6  # surfels of the other state, one of which must be of the same part where a point lands on a surface
@@ -19,13 +19,13 @@ NEIGHBOURS = 6  # surfels of the other state, one of which must be of the same p
 STILL = 0.3
 
 
-def gains_of(problem: Problem, motions: Motions, labelling: Labelling) -> Tensor:
-    """[K] how much brighter each part is at the end (``turning_gains``)."""
+def light_of(problem: Problem, motions: Motions, labelling: Labelling) -> TurnedLight:
+    """How much brighter each part is at the end (``turned_light``)."""
     surfels, labels = problem.surfels, [labelling.labels(s) for s in (0, 1)]
     points, normals, colours = ([getattr(s, name) for s in surfels] for name in ("points", "normals", "colours"))
     transforms = [motions.transform(k) for k in range(len(motions))]
     reach = 2 * problem.scale.spacing + problem.scale.tp
-    return turning_gains(points, normals, colours, labels, transforms, motions.turn.tolist(), reach)
+    return turned_light(points, normals, colours, labels, transforms, motions.turn.tolist(), reach)
 
 
 def violation(
@@ -35,14 +35,14 @@ def violation(
     state: int,
     index: Tensor,
     views: int = 32,
-    gains: Tensor | None = None,
+    light: TurnedLight | None = None,
 ) -> Tensor:
     """Cost [M] in 0..1 of the labelled surfels ``index`` [M] of ``state``: the share of the other state's views that
     see through where a point is predicted, of those not blocked by something in front; where they see a surface that is
     of another part or another colour, as wrong as empty space (of a plate's other side, ``motions.thick`` away, colours
     tell nothing); where all are blocked ``Landing.HIDDEN``, or by the plate's other side ``Landing.TWO_SIDED``. A moved
-    point that is called static is wrong. gains: of ``gains_of``, if they are known."""
-    gains = gains_of(problem, motions, labelling) if gains is None else gains
+    point that is called static is wrong. light: of ``light_of``, if it is known."""
+    light = light_of(problem, motions, labelling) if light is None else light
     surf, stack, other = problem.surfels[state], problem.stacks[1 - state], problem.surfels[1 - state]
     labels = labelling.labels(state)[index]
     x, n, thick = surf.points[index].clone(), surf.normals[index].clone(), torch.zeros(len(index))
@@ -51,7 +51,8 @@ def violation(
         mine, motion = labels == k + 1, motions[k : k + 1]
         x[mine], n[mine] = motion.apply(x[mine], inverse=state == 1)[0], motion.rotate(n[mine], inverse=state == 1)[0]
         thick[mine] = motion.thick
-        colours[mine] *= 1 / gains[k] if state else gains[k]
+    gains = light.gains(labels, n if state else surf.normals[index])
+    colours *= (1 / gains if state else gains)[:, None]
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(views))
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
     d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
@@ -72,11 +73,11 @@ def image_score(problem: Problem, motions: Motions, labelling: Labelling) -> flo
     """Mean violation over the points that moved or are said to move, of both states together: 0 is a perfect
     explanation."""
     total = mass = 0.0
-    gains = gains_of(problem, motions, labelling)
+    light = light_of(problem, motions, labelling)
     for s in (0, 1):
         index = (problem.moved[s] | (labelling.labels(s) > 0)).nonzero()[:, 0]
         if len(index):
             w = torch.where(problem.moved[s], problem.trust[s], torch.full_like(problem.trust[s], STILL))[index]
-            total += float((violation(problem, motions, labelling, s, index, gains=gains) * w).sum())
+            total += float((violation(problem, motions, labelling, s, index, light=light) * w).sum())
             mass += float(w.sum())
     return total / mass if mass else 0.0
