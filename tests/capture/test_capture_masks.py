@@ -107,6 +107,19 @@ def test_a_front_that_hangs_in_the_air_is_the_objects():
         assert (seen & hull.outline(camera)).sum() > 0.9 * seen.sum()
 
 
+def test_fog_at_the_pictures_rim_is_not_what_they_were_taken_of():
+    """Before a bright ceiling, above the object, where a third of the photographs reaches."""
+    fog = np.random.default_rng(3).uniform((-0.15, -0.15, 1.5), (0.15, 0.15, 1.7), (20_000, 3))
+    outlines = []
+    for k, (camera, bodies) in enumerate(outlined(INSIDE, fog)):
+        cut = 36 if k % 3 else 0
+        low = camera.cropped(0, cut, 128, 96 - cut)
+        outlines.append((low, np.any(bodies, 0)[cut:]))
+        assert bodies[1][cut:].any() == (cut == 0)
+    hull = hull_of(REGION, outlines)
+    assert abs(hull.points[:, 2].max() - 0.9) < 0.1
+
+
 def test_sharpening_moves_an_edge_to_the_picture_and_not_further():
     image = np.full((90, 120, 3), 60, np.uint8) + np.random.default_rng(0).integers(0, 12, (90, 120, 3)).astype(
         np.uint8

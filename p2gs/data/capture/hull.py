@@ -44,7 +44,8 @@ class Hull:
 def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
     """The body in the region's middle that ``outlines`` [h, w] bool have in common, and what hangs in the air: it must
     hang on that body, as a front does whose drawer's sides are too thin to show, while what stands about stands on the
-    floor or leans on a wall. Without cells where there is no body.
+    floor or leans on a wall. But what most photographs do not show is not what they were taken of (fog before a bright
+    ceiling). Without cells where there is no body.
 
     outlines: the camera and what is inside the outline, by photograph.
     """
@@ -67,9 +68,11 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
     away = np.linalg.norm(points - region.centre, axis=1) / region.distance
     weight = np.bincount(bodies, np.exp(-((away / MIDDLE) ** 2)))
     weight[0] = 0.0
-    lowest = np.full(len(weight), np.inf)
+    lowest, shown = np.full(len(weight), np.inf), np.zeros(len(points))
     np.minimum.at(lowest, bodies, above)
-    kept = lowest > step  # a cell of air beneath
+    shown[free] = seen
+    shown = np.bincount(bodies, shown) / np.maximum(np.bincount(bodies), 1)
+    kept = (lowest > step) & (shown > len(outlines) / 2)  # a cell of air beneath
     kept[weight.argmax()], kept[0] = True, False
     return Hull(points[kept[bodies]], step)
 
