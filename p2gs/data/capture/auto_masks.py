@@ -4,7 +4,8 @@ photograph."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from p2gs.data.capture.coarse import Picture, Region, Splat, fit, initial, objec
 from p2gs.data.capture.hull import Hull, hull_of
 from p2gs.data.capture.joint import is_end, states_of
 from p2gs.data.capture.model import Model
-from p2gs.data.capture.segmenters import Segmenter
+from p2gs.data.capture.segmenters import AROUND, Segmenter, frame_of
 from p2gs.data.capture.write import pinhole_of
 from p2gs.data.exposure import corrected
 from p2gs.types import Camera, UserError
@@ -27,20 +28,26 @@ CHANGED = 0.15  # share of the mask that sharpening may change before it is not 
 ALIKE = 0.5  # intersection over union of a model's mask with what the splat shows, below which it means something else
 
 
-def pictures_of(model: Model, photos: Path, gains: dict[int, np.ndarray], keys: list[int], size: int) -> list[Picture]:
-    """The photographs of ``keys`` undistorted, their gains taken out, at a long edge of ``size``."""
+Window = tuple[slice, slice]  # rows and columns of an undistorted photograph
+
+
+def pictures_of(
+    model: Model, photos: Path, gains: dict[int, np.ndarray], windows: dict[int, Window], size: int
+) -> list[Picture]:
+    """The ``windows`` of photographs undistorted, their gains taken out, at a long edge of ``size``."""
     import cv2
 
     out = []
-    for key in keys:
+    for key, window in windows.items():
         photo = model.photos[key]
         lens = model.lenses[photo.lens]
         pinhole = pinhole_of(lens)
         image = corrected(cv2.imread(str(photos / photo.name))[..., ::-1], gains.get(key, np.zeros(3)))
-        image = cv2.remap(image, *pinhole.maps, cv2.INTER_LINEAR)
-        factor = min(1.0, size / max(lens.width, lens.height))
-        width, height = round(lens.width * factor), round(lens.height * factor)
+        image = cv2.remap(image, *pinhole.maps, cv2.INTER_LINEAR)[window]
+        (height, width), (y, x) = image.shape[:2], (side.start for side in window)
         camera = Camera(torch.tensor(photo.viewmat).float(), torch.tensor(pinhole.K).float(), lens.width, lens.height)
+        camera, factor = camera.cropped(x, y, width, height), min(1.0, size / max(width, height))
+        width, height = round(width * factor), round(height * factor)
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         out.append(Picture(camera.scaled(width, height), torch.from_numpy(image).float() / 255))
     return out
@@ -133,37 +140,84 @@ def state_masks(
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, np.ndarray]:
     """Masks [H, W] uint8 in the copies' (distorted) pixels of one state's photographs, by name."""
-    state, keys = "end" if end else "start", [k for k, p in model.photos.items() if is_end(p.name) == end]
-    mine = states_of(model)[:, int(end)]
-    splat = initial(region, model.xyz[mine], model.rgb[mine])
-    pictures = pictures_of(model, photos, gains, keys, COARSE)
-    fit(splat, pictures, region.distance)
-    rows = object_rows(splat, region)
-    hull = hull_of(region, [(p.camera, shares(splat, rows, p.camera) > 0.5) for p in pictures])
-    if len(hull.points) == 0:
+    state = "end" if end else "start"
+    lenses = {k: model.lenses[p.lens] for k, p in model.photos.items() if is_end(p.name) == end}
+    windows: dict[int, Window] = {k: (slice(0, lens.height), slice(0, lens.width)) for k, lens in lenses.items()}
+    look = partial(_look, model, photos, gains, end)
+    seen = look(region, windows)
+    if len(seen.hull.points) == 0:
         raise UserError(f"the object could not be told from the room in state '{state}'; give --masks DIR")
+    near, windows = nearer(region, seen, lenses)
+    closer = look(near, windows) if windows else seen
+    seen = closer if len(closer.hull.points) else seen
     out, others = {}, 0
-    for key, coarse, sharp in zip(keys, pictures, pictures_of(model, photos, gains, keys, SHARP), strict=True):
-        found, believed = object_in(splat, rows, hull, coarse.camera, sharp, segmenter)
+    for (key, coarse), sharp in zip(
+        seen.cameras.items(), pictures_of(model, photos, gains, seen.windows, SHARP), strict=True
+    ):
+        found, believed = object_in(seen.splat, seen.rows, seen.hull, coarse, sharp, segmenter)
         mask, others = without_pores(found), others + (not believed)
-        photo = model.photos[key]
-        out[photo.name] = distorted(mask, model.lenses[photo.lens])
-        if not out[photo.name].any():
-            del out[photo.name]
+        whole = distorted(mask, lenses[key], seen.windows[key])
+        if whole.any():
+            out[model.photos[key].name] = whole
     if others:
         progress(f"{state}: in {others} photographs the model found another thing; there the edge is GrabCut's")
     return out
 
 
-def distorted(mask: np.ndarray, lens) -> np.ndarray:
-    """An undistorted mask [h, w] bool of any size brought into the lens's own picture, [H, W] uint8."""
+@dataclass(frozen=True)
+class Look:
+    """A coarse fit of a state: by photograph the window that it saw and the camera of that; which of its Gaussians are
+    the object [N], and the hull of these."""
+
+    windows: dict[int, Window]
+    cameras: dict[int, Camera]
+    splat: Splat
+    rows: torch.Tensor
+    hull: Hull
+
+
+def _look(
+    model: Model, photos: Path, gains: dict[int, np.ndarray], end: bool, region: Region, windows: dict[int, Window]
+) -> Look:
+    mine = states_of(model)[:, int(end)]
+    splat = initial(region, model.xyz[mine], model.rgb[mine])
+    pictures = pictures_of(model, photos, gains, windows, COARSE)
+    fit(splat, pictures, region.fine)
+    rows = object_rows(splat, region)
+    hull = hull_of(region, [(p.camera, shares(splat, rows, p.camera) > 0.5) for p in pictures])
+    return Look(windows, dict(zip(windows, (p.camera for p in pictures), strict=True)), splat, rows, hull)
+
+
+def nearer(region: Region, seen: Look, lenses: dict) -> tuple[Region, dict[int, Window]]:
+    """The hull's box, and the windows of the photographs about it, for another look in which the object fills the
+    pictures: a table's legs are a pixel wide in the first."""
+    points, windows, shares_ = seen.hull.points, {}, []
+    for key, camera in seen.cameras.items():
+        outline = seen.hull.outline(camera)
+        if outline.any():
+            rows, columns = frame_of(outline, AROUND)
+            factor = lenses[key].width / camera.width
+            ends = [[int(x.start * factor), int(np.ceil(x.stop * factor))] for x in (rows, columns)]
+            high = min(ends[0][1], lenses[key].height), min(ends[1][1], lenses[key].width)
+            windows[key] = (slice(ends[0][0], high[0]), slice(ends[1][0], high[1]))
+            shares_.append(max(high[0] - ends[0][0], high[1] - ends[1][0]) / max(lenses[key].width, lenses[key].height))
+    margin = AROUND * (points.max(0) - points.min(0)).max()
+    box = np.stack([points.min(0) - margin, points.max(0) + margin])
+    if region.box is not None:
+        box = np.stack([np.maximum(box[0], region.box[0]), np.minimum(box[1], region.box[1])])
+    return replace(region, box=box, share=float(np.median(shares_)) if shares_ else 1.0), windows
+
+
+def distorted(mask: np.ndarray, lens, window: Window) -> np.ndarray:
+    """An undistorted mask [h, w] bool of any size of a ``window`` brought into the lens's own picture, [H, W] uint8."""
     import cv2
 
-    K = pinhole_of(lens).K
-    x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    rays = lens.rays(np.stack([x.ravel(), y.ravel()], 1)).reshape(lens.height, lens.width, 2)
-    factor = mask.shape[1] / lens.width
-    u, v = (rays[..., 0] * K[0, 0] + K[0, 2]) * factor - 0.5, (rays[..., 1] * K[1, 1] + K[1, 2]) * factor - 0.5
+    K, (y, x) = pinhole_of(lens).K, (side.start for side in window)
+    across, down = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    rays = lens.rays(np.stack([across.ravel(), down.ravel()], 1)).reshape(lens.height, lens.width, 2)
+    factor = mask.shape[1] / (window[1].stop - x)
+    u = (rays[..., 0] * K[0, 0] + K[0, 2] - x) * factor - 0.5
+    v = (rays[..., 1] * K[1, 1] + K[1, 2] - y) * factor - 0.5
     soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.0)
     return np.where(cv2.remap(soft, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR) > 0.5, 255, 0).astype(
         np.uint8

@@ -42,17 +42,24 @@ class Region:
     """Where to look for the object; z up, floor 0.
 
     centre: [3].  distance: of the cameras.  planes: [n, 4], normal towards the cameras and offset.  box: [2, 3] lowest
-    and highest corner of what the user says the object is within; None: a ball about the centre.
+    and highest corner of what the object is within; None: a ball about the centre.  share: of the photographs' long
+    edge, how much the pictures show of it: lengths that are pixels go with it.
     """
 
     centre: np.ndarray
     distance: float
     planes: np.ndarray
     box: np.ndarray | None = None
+    share: float = 1.0
+
+    @property
+    def fine(self) -> float:
+        """What a pixel of the pictures is worth of lengths over the cameras' distance in whole photographs."""
+        return self.distance * self.share
 
     def free(self, points: np.ndarray) -> np.ndarray:
         """[N] bool: on the cameras' side of every plane and off it."""
-        return (points @ self.planes[:, :3].T - self.planes[:, 3] > OFF_PLANE * self.distance).all(1)
+        return (points @ self.planes[:, :3].T - self.planes[:, 3] > OFF_PLANE * self.fine).all(1)
 
     def holds(self, points: np.ndarray, margin: float = 1.0) -> np.ndarray:
         """[N] bool: within the box, else within ``margin`` times the ball."""

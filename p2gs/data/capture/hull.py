@@ -51,10 +51,10 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
     """
     from scipy.ndimage import label
 
-    step, reach = CELL * region.distance, 1.1 * REGION * region.distance
-    side = np.arange(-reach, reach + step, step)
-    grid = (len(side),) * 3
-    points = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3) + region.centre
+    step, reach = CELL * region.fine, 1.1 * REGION * region.distance
+    low, high = (region.centre - reach, region.centre + reach) if region.box is None else region.box
+    sides = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)
     above = (points @ region.planes[:, :3].T - region.planes[:, 3]).min(1)
     free = np.flatnonzero((above > 0) & (region.box is None or region.holds(points)))
     seen, inside = np.zeros(len(free)), np.zeros(len(free))
@@ -64,7 +64,7 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
         inside[shown] += outline[y[shown], x[shown]]
     solid = np.zeros(len(points), bool)
     solid[free] = (seen >= FEWEST) & (inside >= IN_HULL * seen)
-    bodies = np.asarray(label(solid.reshape(grid), np.ones((3, 3, 3)))[0], np.int64).ravel()  # type: ignore[index]
+    bodies = np.asarray(label(solid.reshape([len(s) for s in sides]), np.ones((3, 3, 3)))[0], np.int64).ravel()  # type: ignore[index]
     away = np.linalg.norm(points - region.centre, axis=1) / region.distance
     weight = np.bincount(bodies, np.exp(-((away / MIDDLE) ** 2)))
     weight[0] = 0.0
