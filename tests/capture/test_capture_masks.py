@@ -1,11 +1,13 @@
 """Masks from 3D on a small room whose object is known, and given masks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from p2gs.data.capture.auto_masks import distorted, object_in, shares, sharpened
-from p2gs.data.capture.coarse import Picture, Region, fit, initial, object_rows, region_of
+from p2gs.data.capture.auto_masks import Look, distorted, nearer, object_in, shares, sharpened
+from p2gs.data.capture.coarse import Picture, Region, Splat, fit, initial, object_rows, region_of
 from p2gs.data.capture.given_masks import folder_masks, shown
 from p2gs.data.capture.hull import hull_of
 from p2gs.data.capture.model import Lens
@@ -118,6 +120,29 @@ def test_fog_at_the_pictures_rim_is_not_what_they_were_taken_of():
         assert bodies[1][cut:].any() == (cut == 0)
     hull = hull_of(REGION, outlines)
     assert abs(hull.points[:, 2].max() - 0.9) < 0.1
+
+
+def test_the_second_look_is_at_the_windows_that_the_hull_fills():
+    """Lenses of four times the coarse pictures' pixels."""
+    drawn = outlined(INSIDE)
+    lenses = {k: Lens("PINHOLE", 512, 384, np.array([440.0, 440.0, 256.0, 192.0])) for k in range(len(drawn))}
+    windows = {k: (slice(0, 384), slice(0, 512)) for k in lenses}
+    hull = hull_of(REGION, [(camera, inside) for camera, (inside,) in drawn])
+    splat = Splat({}, 0)
+    seen = Look(
+        windows, {k: camera for k, (camera, _) in enumerate(drawn)}, splat, torch.zeros(0, dtype=torch.bool), hull
+    )
+    near, windows = nearer(REGION, seen, lenses)
+    for k, (_, (inside,)) in enumerate(drawn):
+        rows, columns = windows[k]
+        assert np.kron(inside, np.ones((4, 4), bool))[windows[k]].sum() == 16 * inside.sum()
+        assert 0.4 < inside.sum() * 16 / ((rows.stop - rows.start) * (columns.stop - columns.start))
+    assert (near.box[0] < INSIDE.min(0)).all() and (near.box[1] > INSIDE.max(0)).all()
+    longest = [max(inside.any(1).sum(), inside.any(0).sum()) for _, (inside,) in drawn]
+    assert near.share == pytest.approx(1.3 * 4 * np.median(longest) / 512, rel=0.15)
+    assert len(hull_of(near, [(camera, inside) for camera, (inside,) in drawn]).points) > len(hull.points)
+    boxed = nearer(replace(REGION, box=np.array([[-0.2, -9, -9], [9, 9, 0.5]])), seen, lenses)[0].box
+    assert boxed[0][0] == -0.2 and boxed[1][2] == 0.5
 
 
 def test_sharpening_moves_an_edge_to_the_picture_and_not_further():

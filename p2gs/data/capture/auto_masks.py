@@ -208,14 +208,15 @@ def nearer(region: Region, seen: Look, lenses: dict) -> tuple[Region, dict[int, 
     return replace(region, box=box, share=float(np.median(shares_)) if shares_ else 1.0), windows
 
 
-def distorted(mask: np.ndarray, lens, window: Window) -> np.ndarray:
-    """An undistorted mask [h, w] bool of any size of a ``window`` brought into the lens's own picture, [H, W] uint8."""
+def distorted(mask: np.ndarray, lens, window: Window | None = None) -> np.ndarray:
+    """An undistorted mask [h, w] bool of any size, of a ``window`` (None: of all), brought into the lens's own picture,
+    [H, W] uint8."""
     import cv2
 
-    K, (y, x) = pinhole_of(lens).K, (side.start for side in window)
+    down, across = window or (slice(0, lens.height), slice(0, lens.width))
+    K, x, y, factor = pinhole_of(lens).K, across.start, down.start, mask.shape[1] / (across.stop - across.start)
     across, down = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.rays(np.stack([across.ravel(), down.ravel()], 1)).reshape(lens.height, lens.width, 2)
-    factor = mask.shape[1] / (window[1].stop - x)
     u = (rays[..., 0] * K[0, 0] + K[0, 2] - x) * factor - 0.5
     v = (rays[..., 1] * K[1, 1] + K[1, 2] - y) * factor - 0.5
     soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.0)
