@@ -10,7 +10,7 @@ from p2gs.data.capture.auto_masks import Look, distorted, nearer, object_in, sha
 from p2gs.data.capture.coarse import Picture, Region, Splat, fit, initial, object_rows, region_of
 from p2gs.data.capture.given_masks import folder_masks, shown
 from p2gs.data.capture.hull import hull_of
-from p2gs.data.capture.model import Lens
+from p2gs.data.capture.model import Lens, Model, Photo
 from p2gs.data.capture.photos import Shot
 from p2gs.data.generated.raytrace import render
 from p2gs.data.generated.shapes import box
@@ -122,26 +122,30 @@ def test_fog_at_the_pictures_rim_is_not_what_they_were_taken_of():
     assert abs(hull.points[:, 2].max() - 0.9) < 0.1
 
 
-def test_the_second_look_is_at_the_windows_that_the_hull_fills():
-    """Lenses of four times the coarse pictures' pixels."""
-    drawn = outlined(INSIDE)
-    lenses = {k: Lens("PINHOLE", 512, 384, np.array([440.0, 440.0, 256.0, 192.0])) for k in range(len(drawn))}
-    windows = {k: (slice(0, 384), slice(0, 512)) for k in lenses}
-    hull = hull_of(REGION, [(camera, inside) for camera, (inside,) in drawn])
-    splat = Splat({}, 0)
-    seen = Look(
-        windows, {k: camera for k, (camera, _) in enumerate(drawn)}, splat, torch.zeros(0, dtype=torch.bool), hull
-    )
-    near, windows = nearer(REGION, seen, lenses)
-    for k, (_, (inside,)) in enumerate(drawn):
+def test_the_second_look_is_at_the_windows_that_both_hulls_fill():
+    """Lenses of four times the coarse pictures' pixels; at the end something is drawn out to the side."""
+    out = INSIDE * [0.3, 0.3, 0.2] + [0.5, 0, 0.5]
+    drawn, looks = outlined(INSIDE, out), []
+    lens = Lens("PINHOLE", 512, 384, np.array([440.0, 440.0, 256.0, 192.0]))
+    model = Model({0: lens}, {}, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    for k, (camera, _) in enumerate(drawn):
+        model.photos[k] = Photo(f"{'end' if k % 2 else 'start'}/{k}.jpg", 0, camera.viewmat.double().numpy())
+    for end in (0, 1):
+        cameras = {k: camera for k, (camera, _) in enumerate(drawn) if k % 2 == end}
+        hull = hull_of(REGION, [(cameras[k], np.any(drawn[k][1][: 1 + end], 0)) for k in cameras])
+        looks.append(Look({}, cameras, Splat({}, 0), torch.zeros(0, dtype=torch.bool), hull))
+    near, windows = nearer(REGION, looks, model)
+    longest = []
+    for k, (_, bodies) in enumerate(drawn):
         rows, columns = windows[k]
-        assert np.kron(inside, np.ones((4, 4), bool))[windows[k]].sum() == 16 * inside.sum()
-        assert 0.4 < inside.sum() * 16 / ((rows.stop - rows.start) * (columns.stop - columns.start))
-    assert (near.box[0] < INSIDE.min(0)).all() and (near.box[1] > INSIDE.max(0)).all()
-    longest = [max(inside.any(1).sum(), inside.any(0).sum()) for _, (inside,) in drawn]
-    assert near.share == pytest.approx(1.3 * 4 * np.median(longest) / 512, rel=0.15)
-    assert len(hull_of(near, [(camera, inside) for camera, (inside,) in drawn]).points) > len(hull.points)
-    boxed = nearer(replace(REGION, box=np.array([[-0.2, -9, -9], [9, 9, 0.5]])), seen, lenses)[0].box
+        seen = np.any(bodies, 0)
+        assert np.kron(seen, np.ones((4, 4), bool))[windows[k]].sum() == 16 * seen.sum()
+        longest.append(max(rows.stop - rows.start, columns.stop - columns.start) / 512)
+        assert longest[-1] < 1.5 * max(seen.any(1).sum(), seen.any(0).sum()) / 128 + 0.05
+    both = np.concatenate([INSIDE, out])
+    assert (near.box[0] < both.min(0)).all() and (near.box[1] > both.max(0)).all()
+    assert near.share == pytest.approx(np.median(longest))
+    boxed = nearer(replace(REGION, box=np.array([[-0.2, -9, -9], [9, 9, 0.5]])), looks, model)[0].box
     assert boxed[0][0] == -0.2 and boxed[1][2] == 0.5
 
 

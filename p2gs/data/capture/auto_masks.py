@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -130,40 +129,6 @@ def segmented(segmenter: Segmenter, image: np.ndarray, share: np.ndarray, outlin
     return found if (found & drawn).sum() >= ALIKE * (found | drawn).sum() else None
 
 
-def state_masks(
-    model: Model,
-    photos: Path,
-    gains: dict,
-    region: Region,
-    end: bool,
-    segmenter: Segmenter | None = None,
-    progress: Callable[[str], None] = lambda text: None,
-) -> dict[str, np.ndarray]:
-    """Masks [H, W] uint8 in the copies' (distorted) pixels of one state's photographs, by name."""
-    state = "end" if end else "start"
-    lenses = {k: model.lenses[p.lens] for k, p in model.photos.items() if is_end(p.name) == end}
-    windows: dict[int, Window] = {k: (slice(0, lens.height), slice(0, lens.width)) for k, lens in lenses.items()}
-    look = partial(_look, model, photos, gains, end)
-    seen = look(region, windows)
-    if len(seen.hull.points) == 0:
-        raise UserError(f"the object could not be told from the room in state '{state}'; give --masks DIR")
-    near, windows = nearer(region, seen, lenses)
-    closer = look(near, windows) if windows else seen
-    seen = closer if len(closer.hull.points) else seen
-    out, others = {}, 0
-    for (key, coarse), sharp in zip(
-        seen.cameras.items(), pictures_of(model, photos, gains, seen.windows, SHARP), strict=True
-    ):
-        found, believed = object_in(seen.splat, seen.rows, seen.hull, coarse, sharp, segmenter)
-        mask, others = without_pores(found), others + (not believed)
-        whole = distorted(mask, lenses[key], seen.windows[key])
-        if whole.any():
-            out[model.photos[key].name] = whole
-    if others:
-        progress(f"{state}: in {others} photographs the model found another thing; there the edge is GrabCut's")
-    return out
-
-
 @dataclass(frozen=True)
 class Look:
     """A coarse fit of a state: by photograph the window that it saw and the camera of that; which of its Gaussians are
@@ -176,10 +141,12 @@ class Look:
     hull: Hull
 
 
-def _look(
-    model: Model, photos: Path, gains: dict[int, np.ndarray], end: bool, region: Region, windows: dict[int, Window]
+def look(
+    model: Model, photos: Path, gains: dict[int, np.ndarray], region: Region, windows: dict[int, Window], end: bool
 ) -> Look:
+    """One state through ``windows`` of its photographs; those of the other are left out."""
     mine = states_of(model)[:, int(end)]
+    windows = {key: window for key, window in windows.items() if is_end(model.photos[key].name) == end}
     splat = initial(region, model.xyz[mine], model.rgb[mine])
     pictures = pictures_of(model, photos, gains, windows, COARSE)
     fit(splat, pictures, region.fine)
@@ -188,24 +155,50 @@ def _look(
     return Look(windows, dict(zip(windows, (p.camera for p in pictures), strict=True)), splat, rows, hull)
 
 
-def nearer(region: Region, seen: Look, lenses: dict) -> tuple[Region, dict[int, Window]]:
-    """The hull's box, and the windows of the photographs about it, for another look in which the object fills the
-    pictures: a table's legs are a pixel wide in the first."""
-    points, windows, shares_ = seen.hull.points, {}, []
-    for key, camera in seen.cameras.items():
-        outline = seen.hull.outline(camera)
+def nearer(region: Region, seen: list[Look], model: Model) -> tuple[Region, dict[int, Window]]:
+    """The box of what was ``seen`` in both states, and the windows of the photographs about it, for another look in
+    which the object fills the pictures: a table's legs are a pixel wide in the first. One box for both states: what it
+    cuts off (the legs of a table that the object stands on) is cut alike and has not moved."""
+    body = Hull(np.concatenate([of.hull.points for of in seen]), seen[0].hull.step)
+    windows, longest = {}, []
+    for key, camera in ((key, camera) for of in seen for key, camera in of.cameras.items()):
+        outline, lens = body.outline(camera), model.lenses[model.photos[key].lens]
         if outline.any():
-            rows, columns = frame_of(outline, AROUND)
-            factor = lenses[key].width / camera.width
-            ends = [[int(x.start * factor), int(np.ceil(x.stop * factor))] for x in (rows, columns)]
-            high = min(ends[0][1], lenses[key].height), min(ends[1][1], lenses[key].width)
-            windows[key] = (slice(ends[0][0], high[0]), slice(ends[1][0], high[1]))
-            shares_.append(max(high[0] - ends[0][0], high[1] - ends[1][0]) / max(lenses[key].width, lenses[key].height))
-    margin = AROUND * (points.max(0) - points.min(0)).max()
-    box = np.stack([points.min(0) - margin, points.max(0) + margin])
+            factor, ends = lens.width / camera.width, (lens.height, lens.width)
+            windows[key] = tuple(
+                slice(int(side.start * factor), min(int(np.ceil(side.stop * factor)), last))
+                for side, last in zip(frame_of(outline, AROUND), ends, strict=True)
+            )
+            longest.append(max(side.stop - side.start for side in windows[key]) / max(ends))
+    low, high = body.points.min(0), body.points.max(0)
+    box = np.stack([low, high]) + AROUND * (high - low).max() * np.array([[-1.0], [1.0]])
     if region.box is not None:
         box = np.stack([np.maximum(box[0], region.box[0]), np.minimum(box[1], region.box[1])])
-    return replace(region, box=box, share=float(np.median(shares_)) if shares_ else 1.0), windows
+    return replace(region, box=box, share=float(np.median(longest))), windows
+
+
+def masks_of(
+    model: Model,
+    photos: Path,
+    gains: dict[int, np.ndarray],
+    seen: Look,
+    segmenter: Segmenter | None,
+    progress: Callable[[str], None],
+) -> dict[str, np.ndarray]:
+    """Masks [H, W] uint8 in the copies' (distorted) pixels of the photographs of a state, by name."""
+    out, others, state = {}, 0, ""
+    sharp = pictures_of(model, photos, gains, seen.windows, SHARP)
+    for (key, coarse), picture in zip(seen.cameras.items(), sharp, strict=True):
+        photo = model.photos[key]
+        found, believed = object_in(seen.splat, seen.rows, seen.hull, coarse, picture, segmenter)
+        mask, others = without_pores(found), others + (not believed)
+        whole = distorted(mask, model.lenses[photo.lens], seen.windows[key])
+        if whole.any():
+            out[photo.name] = whole
+        state = "end" if is_end(photo.name) else "start"
+    if others:
+        progress(f"{state}: in {others} photographs the model found another thing; there the edge is GrabCut's")
+    return out
 
 
 def distorted(mask: np.ndarray, lens, window: Window | None = None) -> np.ndarray:
@@ -240,5 +233,16 @@ def auto_masks(
     cameras = np.array([p.position for p in model.photos.values()])
     region = replace(region_of(model.xyz, cameras, centre, distance), box=box)
     progress(f"masks: a coarse fit of each state ({len(region.planes) - 1} walls)")
-    both = [state_masks(model, photos, gains, region, end, segmenter, progress) for end in (False, True)]
-    return both[0] | both[1]
+    windows: dict[int, Window] = {}
+    for key, photo in model.photos.items():
+        windows[key] = slice(0, model.lenses[photo.lens].height), slice(0, model.lenses[photo.lens].width)
+    both = [look(model, photos, gains, region, windows, end) for end in (False, True)]
+    for state, seen in zip(("start", "end"), both, strict=True):
+        if len(seen.hull.points) == 0:
+            raise UserError(f"the object could not be told from the room in state '{state}'; give --masks DIR")
+    progress("masks: a closer look at the object")
+    near, windows = nearer(region, both, model)
+    closer = [look(model, photos, gains, near, windows, end) for end in (False, True)]
+    both = closer if all(len(seen.hull.points) for seen in closer) else both
+    start, end = (masks_of(model, photos, gains, seen, segmenter, progress) for seen in both)
+    return start | end
