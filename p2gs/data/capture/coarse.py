@@ -103,16 +103,12 @@ def _cloud(region: Region, generator: torch.Generator) -> np.ndarray:
 
 
 def _plane_grid(plane: np.ndarray, region: Region) -> np.ndarray:
-    """Points of a plane about the foot of the region's middle; where pictures show a share of the photographs, as many
-    once more over that share, in place of the coarse ones there: shadows at the object's foot are no object."""
     n = plane[:3]
     foot = region.centre - (region.centre @ n - plane[3]) * n
-    axes = np.linalg.svd(n[None])[2][1:]
-    s = np.linspace(-1.3, 1.3, int(np.sqrt(GRID)))
-    at = np.stack(np.meshgrid(s, s), -1).reshape(-1, 2) * region.distance
-    if region.share < 1:
-        at = np.concatenate([at[np.abs(at).max(1) > 1.3 * region.fine], at * region.share])
-    return foot + at @ axes
+    u = np.linalg.svd(n[None])[2][1:]
+    side = int(np.sqrt(GRID))
+    s = np.linspace(-1.3, 1.3, side) * region.distance
+    return foot + np.stack(np.meshgrid(s, s), -1).reshape(-1, 2) @ u
 
 
 @dataclass
