@@ -23,7 +23,7 @@ from p2gs.gaussians.splats import Splats
 from p2gs.models.tune import TuneConfig, TwinSteps
 from p2gs.motion.light import TurnedLight, brighter, facing_either
 from p2gs.motion.part_pull import part_pulls
-from p2gs.motion.screw_polish import MotionSteps, MovedGaussians, Side, anchors_of, photometric_cost
+from p2gs.motion.screw_polish import MotionSteps, MovedGaussians, PolishConfig, Side, anchors_of, photometric_cost
 from p2gs.native import at_once, serial_torch
 from p2gs.ops import se3
 from p2gs.ops.carry import RigidMoves
@@ -44,7 +44,7 @@ def fit_together(
     *,
     axes: Tensor | None = None,
     stacks: list[DepthStack] | None = None,
-    tau: float = 0.02,
+    tau: float = PolishConfig.free_static,
     seed: int,
     backend: str = "auto",
     device: torch.device | str = "cpu",

@@ -26,7 +26,7 @@ from p2gs.visibility.depth_stack import DepthStack
 
 FEWEST = 10  # points of a part: fewer are noise; as many that have no direction stand against one being found
 DARK = 1 / 255  # one level of a photograph: what is darker has no ratio
-ROUNDS = 10  # of reweighting; the gains stand still to a thousandth after six
+ROUNDS = 10  # of reweighting, after which gains stand still to a thousandth (seven parts of three objects)
 # what ``seen_from`` and ``facing`` found last: Gaussians, tolerance, results
 _SEEN: WeakKeyDictionary[DepthStack, tuple] = WeakKeyDictionary()
 

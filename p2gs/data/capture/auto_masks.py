@@ -19,13 +19,13 @@ from p2gs.data.capture.write import pinhole_of
 from p2gs.data.exposure import corrected
 from p2gs.types import Camera, UserError
 
+STATES = ("start", "end")
 COARSE = 200  # px, long edge of the splat's pictures
 SHARP = 480  # px, long edge that edges are sharpened at
 BAND = 0.012  # of the long edge, to either side of the drawn edge: two pixels of the splat's pictures
 PORE = 0.03  # of the mask: smaller holes are the coarse splat's, where a plain side gave it nothing to hold on to
 CHANGED = 0.15  # share of the mask that sharpening may change before it is not believed
 ALIKE = 0.5  # intersection over union of a model's mask with what the splat shows, below which it means something else
-
 
 Window = tuple[slice, slice]  # rows and columns of an undistorted photograph
 
@@ -178,15 +178,11 @@ def nearer(region: Region, seen: list[Look], model: Model) -> tuple[Region, dict
 
 
 def masks_of(
-    model: Model,
-    photos: Path,
-    gains: dict[int, np.ndarray],
-    seen: Look,
-    segmenter: Segmenter | None,
-    progress: Callable[[str], None],
-) -> dict[str, np.ndarray]:
-    """Masks [H, W] uint8 in the copies' (distorted) pixels of the photographs of a state, by name."""
-    out, others, state = {}, 0, ""
+    model: Model, photos: Path, gains: dict[int, np.ndarray], seen: Look, segmenter: Segmenter | None
+) -> tuple[dict[str, np.ndarray], int]:
+    """Masks [H, W] uint8 in the copies' (distorted) pixels of the photographs of a state, by name; and in how many the
+    segmenter was not believed."""
+    out, others = {}, 0
     sharp = pictures_of(model, photos, gains, seen.windows, SHARP)
     for (key, coarse), picture in zip(seen.cameras.items(), sharp, strict=True):
         photo = model.photos[key]
@@ -195,10 +191,7 @@ def masks_of(
         whole = distorted(mask, model.lenses[photo.lens], seen.windows[key])
         if whole.any():
             out[photo.name] = whole
-        state = "end" if is_end(photo.name) else "start"
-    if others:
-        progress(f"{state}: in {others} photographs the model found another thing; there the edge is GrabCut's")
-    return out
+    return out, others
 
 
 def distorted(mask: np.ndarray, lens, window: Window | None = None) -> np.ndarray:
@@ -237,12 +230,17 @@ def auto_masks(
     for key, photo in model.photos.items():
         windows[key] = slice(0, model.lenses[photo.lens].height), slice(0, model.lenses[photo.lens].width)
     both = [look(model, photos, gains, region, windows, end) for end in (False, True)]
-    for state, seen in zip(("start", "end"), both, strict=True):
+    for state, seen in zip(STATES, both, strict=True):
         if len(seen.hull.points) == 0:
             raise UserError(f"the object could not be told from the room in state '{state}'; give --masks DIR")
     progress("masks: a closer look at the object")
     near, windows = nearer(region, both, model)
     closer = [look(model, photos, gains, near, windows, end) for end in (False, True)]
     both = closer if all(len(seen.hull.points) for seen in closer) else both
-    start, end = (masks_of(model, photos, gains, seen, segmenter, progress) for seen in both)
-    return start | end
+    out: dict[str, np.ndarray] = {}
+    for state, seen in zip(STATES, both, strict=True):
+        masks, others = masks_of(model, photos, gains, seen, segmenter)
+        out |= masks
+        if others:
+            progress(f"{state}: in {others} photographs the model found another thing; there the edge is GrabCut's")
+    return out
