@@ -22,6 +22,7 @@ from p2gs.types import Camera, UserError
 STATES = ("start", "end")
 COARSE = 200  # px, long edge of the splat's pictures
 SHARP = 480  # px, long edge that edges are sharpened at
+CELLS = 2  # of a hull by which its box is widened: three pixels of the pictures that it was made of
 BAND = 0.012  # of the long edge, to either side of the drawn edge: two pixels of the splat's pictures
 PORE = 0.03  # of the mask: smaller holes are the coarse splat's, where a plain side gave it nothing to hold on to
 CHANGED = 0.15  # share of the mask that sharpening may change before it is not believed
@@ -142,12 +143,19 @@ class Look:
 
 
 def look(
-    model: Model, photos: Path, gains: dict[int, np.ndarray], region: Region, windows: dict[int, Window], end: bool
+    model: Model,
+    photos: Path,
+    gains: dict[int, np.ndarray],
+    region: Region,
+    windows: dict[int, Window],
+    end: bool,
+    before: Look | None = None,
 ) -> Look:
-    """One state through ``windows`` of its photographs; those of the other are left out."""
+    """One state through ``windows`` of its photographs; those of the other are left out. before: an earlier look, which
+    knows what is beside the region."""
     mine = states_of(model)[:, int(end)]
     windows = {key: window for key, window in windows.items() if is_end(model.photos[key].name) == end}
-    splat = initial(region, model.xyz[mine], model.rgb[mine])
+    splat = initial(region, model.xyz[mine], model.rgb[mine], before=None if before is None else before.splat)
     pictures = pictures_of(model, photos, gains, windows, COARSE)
     fit(splat, pictures, region.fine)
     rows = object_rows(splat, region)
@@ -171,7 +179,7 @@ def nearer(region: Region, seen: list[Look], model: Model) -> tuple[Region, dict
             )
             longest.append(max(side.stop - side.start for side in windows[key]) / max(ends))
     low, high = body.points.min(0), body.points.max(0)
-    box = np.stack([low, high]) + AROUND * (high - low).max() * np.array([[-1.0], [1.0]])
+    box = np.stack([low, high]) + CELLS * body.step * np.array([[-1.0], [1.0]])
     if region.box is not None:
         box = np.stack([np.maximum(box[0], region.box[0]), np.minimum(box[1], region.box[1])])
     return replace(region, box=box, share=float(np.median(longest))), windows
@@ -235,7 +243,7 @@ def auto_masks(
             raise UserError(f"the object could not be told from the room in state '{state}'; give --masks DIR")
     progress("masks: a closer look at the object")
     near, windows = nearer(region, both, model)
-    closer = [look(model, photos, gains, near, windows, end) for end in (False, True)]
+    closer = [look(model, photos, gains, near, windows, bool(end), before) for end, before in enumerate(both)]
     both = closer if all(len(seen.hull.points) for seen in closer) else both
     out: dict[str, np.ndarray] = {}
     for state, seen in zip(STATES, both, strict=True):

@@ -137,8 +137,9 @@ class Splat:
         )
 
 
-def initial(region: Region, xyz: np.ndarray, rgb: np.ndarray, seed: int = 0) -> Splat:
-    """The Gaussians to start from. xyz, rgb: the model's points, [M, 3]."""
+def initial(region: Region, xyz: np.ndarray, rgb: np.ndarray, seed: int = 0, before: Splat | None = None) -> Splat:
+    """The Gaussians to start from. xyz, rgb: the model's points, [M, 3].  before: an earlier fit, of whose cloud what
+    the region does not hold stays where it is."""
     cloud = _cloud(region, torch.Generator().manual_seed(seed))
     grids = [g[region.free(g + 0.02 * region.distance * p[:3]) | (p[2] > 0.9)]
              for p in region.planes for g in [_plane_grid(p, region)]]  # fmt: skip
@@ -161,6 +162,10 @@ def initial(region: Region, xyz: np.ndarray, rgb: np.ndarray, seed: int = 0) -> 
         "opacity_logits": opacity,
         "sh": sh,
     }
+    if before is not None:
+        old = {k: v.detach()[: before.cloud] for k, v in before.params.items()}
+        beside = torch.from_numpy(~region.holds(old["means"].double().numpy(), margin=1.1))
+        params = {k: torch.cat([v, old[k][beside]]) for k, v in params.items()}
     return Splat({k: v.clone().requires_grad_() for k, v in params.items()}, len(cloud))
 
 
