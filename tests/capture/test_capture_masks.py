@@ -149,6 +149,20 @@ def test_the_second_look_is_at_the_windows_that_both_hulls_fill():
     assert boxed[0][0] == -0.2 and boxed[1][2] == 0.5
 
 
+def test_the_second_look_knows_what_stands_beside_the_box():
+    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    first = initial(REGION, xyz, rgb)
+    box = np.stack([INSIDE.min(0), INSIDE.max(0)])
+    near = replace(REGION, box=box, share=0.5)
+    second = initial(near, xyz, rgb, before=first)
+    own, beside = second.params["means"][: second.cloud], first.params["means"][: first.cloud]
+    assert near.holds(own.detach().numpy()).all() and second.cloud == first.cloud
+    beside = beside[~torch.from_numpy(near.holds(beside.detach().numpy()))]
+    assert 0 < len(beside) < first.cloud
+    assert torch.equal(second.params["means"][-len(beside) :], beside)
+    assert {len(v) for v in second.params.values()} == {len(initial(near, xyz, rgb).params["means"]) + len(beside)}
+
+
 def test_sharpening_moves_an_edge_to_the_picture_and_not_further():
     image = np.full((90, 120, 3), 60, np.uint8) + np.random.default_rng(0).integers(0, 12, (90, 120, 3)).astype(
         np.uint8
