@@ -55,13 +55,14 @@ def turned_light(
     transforms: Sequence[Tensor],
     turns: list[bool],
     reach: float,
+    alike: bool = False,
 ) -> TurnedLight:
     """How brightness (mean of channels) changes from start to end; not at all for slides and where fewer than
     ``FEWEST`` points are seen in both.
 
     By state: points [N, 3], normals [N, 3] towards whoever sees them (0: nobody does), colours [N, 3] in 0..1, labels
     [N]. transforms: [4, 4] start -> end of each part.  turns: which of them turn.  reach: how far apart what is one
-    place in both states may lie.
+    place in both states may lie.  alike: for every direction, the median.
     """
     of = torch.zeros(len(turns), 4)
     bright = [c.mean(1).clamp_min(DARK).log() for c in colours]
@@ -78,7 +79,11 @@ def turned_light(
             same = (distance[:, 0] < reach) & ((way * normals[1 - s][met]).sum(1) > 0)
             ratios.append((1 - 2 * s) * (bright[1 - s][met] - bright[s][here])[same])
             facing.append((way if s else normals[s][here])[same])
-        if sum(map(len, ratios)) >= FEWEST:
+        if sum(map(len, ratios)) < FEWEST:
+            continue
+        if alike:
+            of[k, 0] = torch.cat(ratios).median()
+        else:
             of[k] = _robust(torch.cat(ratios), torch.cat(facing))
     return TurnedLight(of)
 

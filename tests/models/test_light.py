@@ -50,6 +50,9 @@ def test_each_side_has_its_own_light_and_a_tenth_of_wrong_matches_does_not_matte
     light = turned_light(*both, TURN[None], [True], 0.01)
     seen = light.gains(torch.ones(2, dtype=torch.long), torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
     assert seen.tolist() == pytest.approx([0.5, 1.6], rel=0.03)
+    alike = turned_light(*both, TURN[None], [True], 0.01, alike=True).of[0]
+    assert alike[0].exp() == pytest.approx(1.6, rel=0.01) or alike[0].exp() == pytest.approx(0.5, rel=0.01)
+    assert not alike[1:].any()
 
 
 def test_slides_other_sides_and_few_points_have_no_gain():

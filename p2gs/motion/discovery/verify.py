@@ -20,12 +20,13 @@ STILL = 0.3
 
 
 def light_of(problem: Problem, motions: Motions, labelling: Labelling) -> TurnedLight:
-    """How much brighter each part is at the end (``turned_light``)."""
+    """How much brighter each part is at the end (``turned_light``): one number a part, for while motions are coarse,
+    more of them make up for a door that is shifted within its plane."""
     surfels, labels = problem.surfels, [labelling.labels(s) for s in (0, 1)]
     points, normals, colours = ([getattr(s, name) for s in surfels] for name in ("points", "normals", "colours"))
     transforms = [motions.transform(k) for k in range(len(motions))]
     reach = 2 * problem.scale.spacing + problem.scale.tp
-    return turned_light(points, normals, colours, labels, transforms, motions.turn.tolist(), reach)
+    return turned_light(points, normals, colours, labels, transforms, motions.turn.tolist(), reach, alike=True)
 
 
 def violation(
