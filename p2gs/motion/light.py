@@ -23,6 +23,7 @@ from p2gs.ops.knn import knn
 from p2gs.ops.sh import C0, dc_to_rgb
 from p2gs.types import GaussianTensors
 from p2gs.visibility.depth_stack import DepthStack
+from p2gs.visibility.free_space import landed
 
 FEWEST = 10  # points of a part: fewer are noise; as many that have no direction stand against one being found
 DARK = 1 / 255  # one level of a photograph: what is darker has no ratio
@@ -67,7 +68,7 @@ def turned_light(
     of = torch.zeros(len(turns), 4)
     bright = [c.mean(1).clamp_min(DARK).log() for c in colours]
     for k in (k for k, turn in enumerate(turns) if turn):
-        mine, ratios, facing = [(x == k + 1).nonzero().squeeze(1) for x in labels], [], []
+        mine, ratios, ways = [(x == k + 1).nonzero().squeeze(1) for x in labels], [], []
         if min(map(len, mine)) == 0:
             continue
         for s in (0, 1):
@@ -78,13 +79,13 @@ def turned_light(
             met = there[near[:, 0]]
             same = (distance[:, 0] < reach) & ((way * normals[1 - s][met]).sum(1) > 0)
             ratios.append((1 - 2 * s) * (bright[1 - s][met] - bright[s][here])[same])
-            facing.append((way if s else normals[s][here])[same])
+            ways.append((way if s else normals[s][here])[same])
         if sum(map(len, ratios)) < FEWEST:
             continue
         if alike:
             of[k, 0] = torch.cat(ratios).median()
         else:
-            of[k] = _robust(torch.cat(ratios), torch.cat(facing))
+            of[k] = _robust(torch.cat(ratios), torch.cat(ways))
     return TurnedLight(of)
 
 
@@ -122,9 +123,8 @@ def as_lit_there(
         colours.append(dc_to_rgb(g.sh[:, 0]).clamp(0, 1).detach().cpu())
         labels.append(torch.where(normals[-1].any(1), of, -1))
     light = turned_light(points, normals, colours, labels, list(motions.transforms), turns, moving)
-    turned = with_static(motions.transforms)[motions.labels[1].clamp_min(0)][:, :3, :3].to(normals[1])
-    at_start = normals[0], (turned.transpose(1, 2) @ normals[1][..., None])[..., 0]
-    gains = [light.gains(of, facing) for of, facing in zip(motions.labels, at_start, strict=True)]
+    at_start = normals[0], _turned_back(normals[1], motions.labels[1].clamp_min(0), motions.transforms)
+    gains = [light.gains(of, ways) for of, ways in zip(motions.labels, at_start, strict=True)]
     return [
         replace(state, gaussians=brighter(state.gaussians, 1 / gain if s else gain))
         for s, (state, gain) in enumerate(zip(states, gains, strict=True))
@@ -137,11 +137,14 @@ def facing_either(
     """[N, 3] the shortest axis of each of a twin's Gaussians at the start, towards the cameras of either state that see
     it on a surface; 0 where none does. labels [N], transforms [K, 4, 4]: their parts and these parts' motions."""
     own = g.detach().to("cpu")
-    T = with_static(transforms)[labels].to(own.means)
-    there = stacks[1].seen_from(se3.apply(T, own.means[:, None])[:, 0], tau)
-    return _towards(
-        own, stacks[0].seen_from(own.means, tau) + (T[:, :3, :3].transpose(1, 2) @ there[..., None])[..., 0]
-    )
+    there = stacks[1].seen_from(landed(own.means, labels, transforms), tau)
+    return _towards(own, stacks[0].seen_from(own.means, tau) + _turned_back(there, labels, transforms))
+
+
+def _turned_back(ways: Tensor, labels: Tensor, transforms: Tensor) -> Tensor:
+    """Directions [N, 3] at the end of what parts ``labels`` [N] carry, as they were at the start."""
+    R = with_static(transforms)[labels][:, :3, :3].to(ways)
+    return (R.transpose(1, 2) @ ways[..., None])[..., 0]
 
 
 def facing(g: GaussianTensors, stack: DepthStack, tau: float) -> Tensor:

@@ -13,13 +13,12 @@ import torch
 from p2gs.data.capture.coarse import Picture, Region, Splat, fit, initial, object_rows, region_of
 from p2gs.data.capture.hull import Hull, hull_of
 from p2gs.data.capture.joint import is_end, states_of
-from p2gs.data.capture.model import Model
+from p2gs.data.capture.model import Lens, Model
 from p2gs.data.capture.segmenters import AROUND, Segmenter, frame_of
-from p2gs.data.capture.write import pinhole_of
+from p2gs.data.capture.write import STATES, pinhole_of
 from p2gs.data.exposure import corrected
 from p2gs.types import Camera, UserError
 
-STATES = ("start", "end")
 COARSE = 200  # px, long edge of the splat's pictures
 SHARP = 480  # px, long edge that edges are sharpened at
 CELLS = 2  # of a hull by which its box is widened: three pixels of the pictures that it was made of
@@ -31,19 +30,23 @@ ALIKE = 0.5  # intersection over union of a model's mask with what the splat sho
 Window = tuple[slice, slice]  # rows and columns of an undistorted photograph
 
 
+def whole(lens: Lens) -> Window:
+    """All of a lens's photographs."""
+    return slice(0, lens.height), slice(0, lens.width)
+
+
 def pictures_of(
     model: Model, photos: Path, gains: dict[int, np.ndarray], windows: dict[int, Window], size: int
 ) -> list[Picture]:
     """The ``windows`` of photographs undistorted, their gains taken out, at a long edge of ``size``."""
     import cv2
 
-    out = []
+    out, pinholes = [], {key: pinhole_of(lens) for key, lens in model.lenses.items()}
     for key, window in windows.items():
         photo = model.photos[key]
-        lens = model.lenses[photo.lens]
-        pinhole = pinhole_of(lens)
+        lens, pinhole = model.lenses[photo.lens], pinholes[photo.lens]
         image = corrected(cv2.imread(str(photos / photo.name))[..., ::-1], gains.get(key, np.zeros(3)))
-        image = cv2.remap(image, *pinhole.maps, cv2.INTER_LINEAR)[window]
+        image = cv2.remap(image, *(of[window] for of in pinhole.maps), cv2.INTER_LINEAR)
         (height, width), (y, x) = image.shape[:2], (side.start for side in window)
         camera = Camera(torch.tensor(photo.viewmat).float(), torch.tensor(pinhole.K).float(), lens.width, lens.height)
         camera, factor = camera.cropped(x, y, width, height), min(1.0, size / max(width, height))
@@ -169,15 +172,15 @@ def nearer(region: Region, seen: list[Look], model: Model) -> tuple[Region, dict
     cuts off (the legs of a table that the object stands on) is cut alike and has not moved."""
     body = Hull(np.concatenate([of.hull.points for of in seen]), seen[0].hull.step)
     windows, longest = {}, []
-    for key, camera in ((key, camera) for of in seen for key, camera in of.cameras.items()):
+    for key, camera in (seen[0].cameras | seen[1].cameras).items():
         outline, lens = body.outline(camera), model.lenses[model.photos[key].lens]
         if outline.any():
-            factor, ends = lens.width / camera.width, (lens.height, lens.width)
+            factor = lens.width / camera.width
             windows[key] = tuple(
-                slice(int(side.start * factor), min(int(np.ceil(side.stop * factor)), last))
-                for side, last in zip(frame_of(outline, AROUND), ends, strict=True)
+                slice(int(side.start * factor), min(int(np.ceil(side.stop * factor)), all_.stop))
+                for side, all_ in zip(frame_of(outline, AROUND), whole(lens), strict=True)
             )
-            longest.append(max(side.stop - side.start for side in windows[key]) / max(ends))
+            longest.append(max(side.stop - side.start for side in windows[key]) / max(lens.width, lens.height))
     low, high = body.points.min(0), body.points.max(0)
     box = np.stack([low, high]) + CELLS * body.step * np.array([[-1.0], [1.0]])
     if region.box is not None:
@@ -196,9 +199,9 @@ def masks_of(
         photo = model.photos[key]
         found, believed = object_in(seen.splat, seen.rows, seen.hull, coarse, picture, segmenter)
         mask, others = without_pores(found), others + (not believed)
-        whole = distorted(mask, model.lenses[photo.lens], seen.windows[key])
-        if whole.any():
-            out[photo.name] = whole
+        placed = distorted(mask, model.lenses[photo.lens], seen.windows[key])
+        if placed.any():
+            out[photo.name] = placed
     return out, others
 
 
@@ -207,7 +210,7 @@ def distorted(mask: np.ndarray, lens, window: Window | None = None) -> np.ndarra
     [H, W] uint8."""
     import cv2
 
-    down, across = window or (slice(0, lens.height), slice(0, lens.width))
+    down, across = window or whole(lens)
     K, x, y, factor = pinhole_of(lens).K, across.start, down.start, mask.shape[1] / (across.stop - across.start)
     across, down = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.rays(np.stack([across.ravel(), down.ravel()], 1)).reshape(lens.height, lens.width, 2)
@@ -234,9 +237,7 @@ def auto_masks(
     cameras = np.array([p.position for p in model.photos.values()])
     region = replace(region_of(model.xyz, cameras, centre, distance), box=box)
     progress(f"masks: a coarse fit of each state ({len(region.planes) - 1} walls)")
-    windows: dict[int, Window] = {}
-    for key, photo in model.photos.items():
-        windows[key] = slice(0, model.lenses[photo.lens].height), slice(0, model.lenses[photo.lens].width)
+    windows = {key: whole(model.lenses[photo.lens]) for key, photo in model.photos.items()}
     both = [look(model, photos, gains, region, windows, end) for end in (False, True)]
     for state, seen in zip(STATES, both, strict=True):
         if len(seen.hull.points) == 0:

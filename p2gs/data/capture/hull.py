@@ -68,11 +68,11 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
     away = np.linalg.norm(points - region.centre, axis=1) / region.distance
     weight = np.bincount(bodies, np.exp(-((away / MIDDLE) ** 2)))
     weight[0] = 0.0
-    lowest, shown = np.full(len(weight), np.inf), np.zeros(len(points))
+    lowest, looks = np.full(len(weight), np.inf), np.zeros(len(points))
     np.minimum.at(lowest, bodies, above)
-    shown[free] = seen
-    shown = np.bincount(bodies, shown) / np.maximum(np.bincount(bodies), 1)
-    kept = (lowest > step) & (shown > len(outlines) / 2)  # a cell of air beneath
+    looks[free] = seen
+    looks = np.bincount(bodies, looks) / np.maximum(np.bincount(bodies), 1)
+    kept = (lowest > step) & (looks > len(outlines) / 2)  # a cell of air beneath
     kept[weight.argmax()], kept[0] = True, False
     return Hull(points[kept[bodies]], step)
 
