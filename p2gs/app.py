@@ -110,7 +110,7 @@ def parser(prog: str = "p2gs") -> Parser:
         "--floating", dest="fixed", action="store_false", default=None, help="the base may be pushed and fall over"
     )
     size = export.add_mutually_exclusive_group()
-    size.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of the input (default 1)")
+    size.add_argument("--scale", type=float, metavar="M", help="metres per unit of the input (default 1)")
     size.add_argument(
         "--height", type=float, metavar="M", help="the object's height at the start in metres, instead of --scale"
     )
@@ -204,7 +204,7 @@ def parser(prog: str = "p2gs") -> Parser:
         "--poses", metavar="PATH", help="a COLMAP model or transforms.json of both states: no structure from motion"
     )
     capture.add_argument(
-        "--static", type=int, metavar="N", help="which hypothesis of capture.json is the room (default: the widest)"
+        "--static", type=int, metavar="N", help="which of hypotheses.html is the room (default: the widest)"
     )
     capture.add_argument(
         "--height", type=float, metavar="M", help="height of the object in metres, where there is no board"

@@ -126,8 +126,10 @@ def capture(args: argparse.Namespace) -> int:
     for name in ("max_views", "size"):
         if getattr(args, name) < 8:
             raise UserError(f"data capture: {name} is {getattr(args, name)}, expected at least 8")
-    if args.height is not None and not args.height > 0:
+    if args.height is not None and not 0 < args.height < float("inf"):
         raise UserError(f"data capture: --height is {args.height:g}, expected metres above 0")
+    if args.poses is not None and args.static is not None:
+        raise UserError("data capture: --static chooses how the states lie to one another, which --poses says already")
     options = Options(
         masks=None if args.masks is None else Path(args.masks), ignore=args.mask_means == "ignore",
         poses=None if args.poses is None else Path(args.poses), static=args.static, height=args.height,

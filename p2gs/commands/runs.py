@@ -4,6 +4,7 @@ code."""
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -116,24 +117,41 @@ def _warn(text: str) -> None:
 
 
 def _metres_per_unit(args: argparse.Namespace, run: Path) -> float:
-    """Of --scale or --height; warns where the object comes out in a size that its kind has not."""
+    """Of --scale or --height, else 1; warns where a capture has no scale, and where the object comes out in a size that
+    its kind has not."""
     from p2gs.export.asset import start_box
     from p2gs.export.metadata import read_meta
     from p2gs.export.sizes import unlikely_size
 
-    if not args.scale > 0:
+    if args.scale is not None and not args.scale > 0:
         raise UserError(f"--scale: expected a positive number of metres per unit, got {args.scale:g}")
     box = start_box(run)
-    scale, sides = args.scale, box[1] - box[0]
+    scale, sides = 1.0 if args.scale is None else args.scale, box[1] - box[0]
     if args.height is not None:
         if not args.height > 0:
             raise UserError(f"--height: expected a positive number of metres, got {args.height:g}")
         scale = args.height / float(sides[2])
+    elif args.scale is None and not _in_metres(run):
+        _warn(
+            "the capture says nothing of metres, so the object's diagonal is taken for 1 m: give its --height, or lay "
+            "the marker board (p2gs data board) beside the object when you photograph it"
+        )
     category = "" if args.meta is None else str(read_meta(args.meta).get("category", ""))
     unlikely = unlikely_size(scale * float(sides.max()), f"{category} {run.resolve().name}")
     if unlikely is not None:
         _warn(unlikely)
     return scale
+
+
+def _in_metres(run: Path) -> bool:
+    """False where the run's scene was captured without anything that says how long a metre is."""
+    data = run_values(run).get("data")
+    root = data.get("root") if isinstance(data, dict) else None
+    try:
+        facts = json.loads((Path(str(root)) / "capture.json").read_text()) if root else {}
+        return bool(facts["scale"]["metric"])
+    except (OSError, ValueError, TypeError, KeyError):  # no capture, or gone since
+        return True
 
 
 def _check(folder: Path) -> int:

@@ -15,40 +15,78 @@ import numpy as np
 import torch
 
 from p2gs.data.capture.model import similarity
+from p2gs.data.frames import pose_matrix
 from p2gs.data.ground_truth import parse_joint
 from p2gs.gaussians.twin_json import load_twin
 from p2gs.metrics.modules import JointError
 from p2gs.models.registered import REGISTRATION, read_registration
 from p2gs.scores.evaluate import scene_folder
-from p2gs.types import Joint, UserError
+from p2gs.types import Joint, UserError, short
 
 STATES = ("start", "end")
 
 
-def _json(path: Path):
+def _json(path: Path, key: str, kind: type | tuple[type, ...]):
+    """What the file has under a key. Raises UserError where it is missing or has none of that kind."""
     if not path.is_file():
         raise UserError(f"{path}: is missing, so the capture cannot be scored")
-    return json.loads(path.read_text())
+    try:
+        value = json.loads(path.read_text())[key]
+        if not isinstance(value, kind):
+            raise ValueError(f"it is {short(value)}")
+        return value
+    except (ValueError, KeyError, TypeError, RecursionError) as err:
+        raise UserError(
+            f"{path}: has no readable '{key}' ({short(str(err))}), so the capture cannot be scored"
+        ) from err
 
 
 def camera_pairs(scene: Path, truth: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """State -> (own, true) camera-to-world matrices [N, 4, 4] of the photographs that both know. OpenGL axes."""
-    true = _json(truth / "cameras.json")["c2w"]
-    source = {i["file"]: i for i in _json(scene / "capture.json")["images"] if i["file"]}
-    out = {}
-    for state in STATES:
-        own, other = [], []
-        for frame in _json(scene / f"transforms_train_{state}.json")["frames"]:
-            key = f"{state}/{Path(source[frame['file_path']]['source']).stem}"
-            if key in true:
-                own.append(frame["transform_matrix"])
-                other.append(true[key])
-        if len(own) < 3:
+    """State -> (own, true) camera-to-world matrices [N, 4, 4] of the photographs that both know. OpenGL axes.
+
+    Raises UserError, naming the file, where one cannot be read or two do not belong together.
+    """
+    true, facts = _json(truth / "cameras.json", "c2w", dict), scene / "capture.json"
+    images = _json(facts, "images", list)
+    try:
+        source = {i["file"]: str(i["source"]) for i in images if i["file"]}
+    except (KeyError, TypeError) as err:
+        raise UserError(f"{facts}: an image has no 'file' and 'source'; expected what p2gs data capture wrote") from err
+    return {s: _pairs_of(s, scene / f"transforms_train_{s}.json", source, facts, true, truth) for s in STATES}
+
+
+def _pairs_of(
+    state: str, path: Path, source: dict, facts: Path, true: dict, truth: Path
+) -> tuple[np.ndarray, np.ndarray]:
+    """A state's ``camera_pairs``. path: its transforms.  source: by file, of the capture.json ``facts``."""
+    own, other = [], []
+    for i, frame in enumerate(_json(path, "frames", list)):
+        file = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(file, str) or file not in source:
             raise UserError(
-                f"{truth / 'cameras.json'}: knows {len(own)} photographs of state '{state}', expected at least 3"
+                f"{facts}: has no image {short(file)}, which {path.name} has as frame {i}; expected both as the same "
+                "p2gs data capture wrote them"
             )
-        out[state] = (np.array(own, float), np.array(other, float))
-    return out
+        key = f"{state}/{Path(source[file]).stem}"
+        if key in true:
+            own.append(_pose(frame.get("transform_matrix"), f"{path}: frame {i}"))
+            other.append(_pose(true[key], f"{truth / 'cameras.json'}: {key}"))
+    if len(own) < 3:
+        raise UserError(
+            f"{truth / 'cameras.json'}: knows {len(own)} photographs of state '{state}', expected at least 3"
+        )
+    return np.array(own), np.array(other)
+
+
+def _pose(value, where: str) -> np.ndarray:
+    """[4, 4] float64. Raises UserError for what is no pose."""
+    try:
+        pose = pose_matrix(value)
+    except ValueError as err:
+        raise UserError(f"{where}: camera pose is not a 4x4 matrix of numbers") from err
+    if not np.isfinite(pose).all():
+        raise UserError(f"{where}: camera pose holds values that are not finite")
+    return pose
 
 
 def rigid_between(own: np.ndarray, other: np.ndarray, with_scale: bool) -> np.ndarray:
@@ -63,7 +101,9 @@ def moved_joint(joint: Joint, T: np.ndarray) -> Joint:
     origin = scale * (R @ joint.origin.double()) + torch.tensor(T[:3, 3])
     unit = 1.0 if joint.type == "revolute" else scale
     limits = (joint.limits[0] * unit, joint.limits[1] * unit)
-    return Joint(joint.type, R @ joint.axis.double(), origin, joint.motion * unit, limits, joint.transform)
+    placed = torch.tensor(T)
+    transform = placed @ joint.transform.double() @ torch.linalg.inv(placed)
+    return Joint(joint.type, R @ joint.axis.double(), origin, joint.motion * unit, limits, transform)
 
 
 def base_points(truth: Path, count: int = 2000) -> Optional[np.ndarray]:
@@ -95,7 +135,7 @@ def evaluate_capture(run: Path | str, truth: Path | str, root: Optional[Path | s
     D = rigid_between(placed, end_true, with_scale=False)
     points = base_points(truth)
     off = None if points is None else np.linalg.norm(points @ D[:3, :3].T + D[:3, 3] - points, axis=1)
-    info = _json(truth / "trans.json")["trans_info"]
+    info = _json(truth / "trans.json", "trans_info", (dict, list))
     true = [
         parse_joint(e, f"{truth / 'trans.json'}: joint {i}")
         for i, e in enumerate(info if isinstance(info, list) else [info])

@@ -30,7 +30,7 @@ def model():
 @pytest.mark.skipif(shutil.which("node") is None, reason="node is not there")
 def test_two_clicks_in_each_plan_are_the_option(tmp_path):
     """Clicks where the plan draws the box's corners give the box back, whichever corners are clicked."""
-    plans = [_plan(model(), BOX, axes, "") for axes in ((0, 1), (0, 2))]
+    plans = [_plan(model(), np.zeros(0, object), axes, "", BOX) for axes in ((0, 1), (0, 2))]
     clicks = []
     for plan in plans:
         size, axes = re.search(r'data-size="([^"]+)" data-axes="([^"]+)"', plan).groups()
@@ -56,7 +56,7 @@ console.log(option());
 
 def test_the_page_says_the_box_that_was_found(tmp_path, monkeypatch):
     monkeypatch.setattr("p2gs.data.capture.page.contact_sheet", lambda *a, **k: None)
-    write_page(tmp_path, model(), BOX, {"images": [], "gains": {}})
+    write_page(tmp_path, model(), {}, BOX, {"images": [], "gains": {}})
     assert "--box -0.2000 -0.3000 0.0000 0.3000 0.4000 0.9000" in (tmp_path / "capture.html").read_text()
 
 

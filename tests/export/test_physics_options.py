@@ -1,5 +1,7 @@
 """Size and mass as asked for; normals and extents in what is written."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
@@ -54,6 +56,20 @@ def test_a_size_that_nothing_has_is_warned_of(run, tmp_path, capsys):
     assert p2gs(["export", str(run), "--format", "ply", "--scale", "10", "--out", str(tmp_path)]) == 0
     assert "longest side comes out as" in capsys.readouterr().err
     assert unlikely_size(0.8) is None and unlikely_size(0.001) is not None
+
+
+def test_a_capture_without_a_scale_is_warned_of(run, tmp_path, capsys):
+    scene, config = tmp_path / "scene", run / "config.yaml"
+    scene.mkdir()
+    config.write_text(f"data:\n  root: {scene}\n")
+    words = ["export", str(run), "--format", "obj", "--out", str(tmp_path / "out")]
+    try:
+        for metric, more, warned in ((False, [], True), (False, ["--height", "1"], False), (True, [], False)):
+            (scene / "capture.json").write_text(json.dumps({"scale": {"metric": metric}}))
+            assert p2gs([*words, *more]) == 0
+            assert ("says nothing of metres" in capsys.readouterr().err) == warned
+    finally:
+        config.unlink()
 
 
 def test_a_laptop_as_large_as_a_table_is_warned_of(run, tmp_path, capsys):

@@ -156,7 +156,8 @@ def look(
 ) -> Look:
     """One state through ``windows`` of its photographs; those of the other are left out. before: an earlier look, which
     knows what is beside the region."""
-    mine = states_of(model)[:, int(end)]
+    seen = states_of(model)
+    mine = seen[:, int(end)] | ~seen.any(1)  # points that came with given poses are of both states
     windows = {key: window for key, window in windows.items() if is_end(model.photos[key].name) == end}
     splat = initial(region, model.xyz[mine], model.rgb[mine], before=None if before is None else before.splat)
     pictures = pictures_of(model, photos, gains, windows, COARSE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Optional
 
 import numpy as np
 
@@ -16,11 +17,11 @@ MIN_SHARE = 0.08  # of the points: less is no floor
 
 @dataclass(frozen=True)
 class Floor:
-    """Points x of the floor: normal . x = height, normal [3] pointing up.  source: board, floor plane, or cameras (no
-    floor found)."""
+    """Points x of the floor: normal . x = height, normal [3] pointing up.  height: None where nothing says how high the
+    floor is.  source: of the normal: board, floor plane, or cameras (no plane found)."""
 
     normal: np.ndarray
-    height: float
+    height: Optional[float]
     source: str
 
 
@@ -42,8 +43,11 @@ def fit_plane(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def floor_of(model: Model, seed: int = 0) -> Floor:
-    """The lowest large plane that is nearly level; without one the lowest points under the pictures' mean up."""
+    """The lowest large plane that is nearly level; without one the lowest points under the pictures' mean up; without
+    points up alone, for no pose says at what height of its frame the floor is."""
     up = mean_up(model)
+    if len(model.xyz) == 0:
+        return Floor(up, None, "cameras")
     _, distance = model.centre()
     points = model.xyz[np.linalg.norm(model.xyz - np.median(model.xyz, axis=0), axis=1) < 4 * distance]
     best, most, rng = None, 0.0, np.random.default_rng(seed)
@@ -65,14 +69,15 @@ def floor_of(model: Model, seed: int = 0) -> Floor:
         if score > most:
             best, most = near, score
     if best is None or most < MIN_SHARE * len(points):
-        return Floor(up, float(np.quantile(heights, 0.02)) if len(heights) else 0.0, "cameras")
+        return Floor(up, float(np.quantile(heights, 0.02)) if len(heights) else None, "cameras")
     normal, offset = fit_plane(low[best])
     sign = float(np.sign(normal @ up))
     return Floor(normal * sign, float(offset * sign), "floor plane")
 
 
 def to_world(floor: Floor, model: Model, metres_per_unit: float) -> np.ndarray:
-    """[4, 4] similarity model -> scene: z up, the floor at 0, what the cameras look at above the origin."""
+    """[4, 4] similarity model -> scene: z up, the floor at 0, what the cameras look at above the origin; at the origin
+    where the floor's height is not known."""
     centre, _ = model.centre()
     z = floor.normal
     towards = np.mean([p.position for p in model.photos.values()], axis=0) - centre
@@ -81,6 +86,6 @@ def to_world(floor: Floor, model: Model, metres_per_unit: float) -> np.ndarray:
     R = np.stack([x, np.cross(z, x), z])
     T = np.eye(4)
     T[:3, :3] = metres_per_unit * R
-    foot = centre - (centre @ z - floor.height) * z
+    foot = centre if floor.height is None else centre - (centre @ z - floor.height) * z
     T[:3, 3] = -T[:3, :3] @ foot
     return T

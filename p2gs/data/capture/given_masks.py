@@ -14,16 +14,18 @@ STATES = ("start", "end")
 
 
 def mask_file(folder: Path, shot: Shot) -> Path:
-    """The mask of a photograph: ``DIR/start/IMG_1.png``, ``IMG_1.jpg.png`` and the like, or the same below DIR itself.
+    """The mask of a photograph: ``DIR/start/IMG_1.jpg.png``, ``IMG_1.png`` and the like, or the same below DIR itself;
+    of a video's frame ``walk.mp4#1.03s.png``, as capture.json names it.
 
     Raises UserError naming the photograph where there is none, or where both states' photographs share a name in one
     folder.
     """
-    state, stem = shot.name.split("/")[0], Path(shot.source).stem
+    state, source = shot.name.split("/")[0], Path(shot.source)
+    stem = source.name if "#" in source.name else source.stem  # frames of one second have one stem
     for base in (folder / state, folder):
-        for suffix in SUFFIXES:
-            if (base / f"{stem}{suffix}").is_file():
-                return base / f"{stem}{suffix}"
+        for name in (f"{source.name}.png", *(f"{stem}{suffix}" for suffix in SUFFIXES)):
+            if (base / name).is_file():
+                return base / name
     raise UserError(f"{folder}: has no mask for {shot.source}; expected {state}/{stem}.png, white where the object is")
 
 

@@ -8,6 +8,7 @@ makes of Polycam, Record3D, KIRI and others. No pycolmap is needed.
 from __future__ import annotations
 
 import json
+from collections.abc import Container
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -18,9 +19,14 @@ from p2gs.data.capture.model import ONE_FOCAL, Lens, Model, Photo
 from p2gs.data.capture.photos import Shot
 from p2gs.data.frames import MAX_COORDINATE, opengl_pose, pose_matrix
 from p2gs.data.report import Report
-from p2gs.types import UserError
+from p2gs.types import UserError, short
 
 KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "distortion_params")
+MIN_SHARE = 0.9  # of a state's photographs must be placed, by poses that are brought or solved
+MIN_REGISTERED = 8  # photographs of a state, likewise
+NAMED = 3  # photographs without a pose that a refusal names
+MAX_POINTS = 100_000  # of a cloud, drawn at random: a floor shows in far fewer, and is sought among all 600 times
+GREY = 128  # of 255: points that nobody observes have no colour that anything looks at
 
 
 def read_poses(path: Path) -> Model:
@@ -92,21 +98,17 @@ def _c2w(given, where: str) -> np.ndarray:
 
 
 def read_transforms(files: list[tuple[Path, str]]) -> Model:
-    """Model without points of nerfstudio files, each with a prefix for its photographs' names. All must share one
-    frame.
+    """Model of nerfstudio files, each with a prefix for its photographs' names. All must share one frame. Its points
+    are those of ``ply_file_path``, which no photograph observes; without such a file it has none.
 
     Raises UserError where a file lacks something, naming it.
     """
     lenses: dict[int, Lens] = {}
     photos: dict[int, Photo] = {}
     known: dict[tuple, int] = {}
+    clouds = [np.zeros((0, 3))]
     for path, prefix in files:
-        try:
-            meta = json.loads(path.read_text())
-        except (ValueError, RecursionError) as err:
-            raise UserError(f"{path}: is not valid JSON ({err})") from err
-        if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
-            raise UserError(f"{path}: has no list 'frames'")
+        meta = _meta(path)
         undo = _unapplied(meta, str(path))
         for i, frame in enumerate(meta["frames"]):
             where = f"{path}: frame {i}"
@@ -129,8 +131,42 @@ def read_transforms(files: list[tuple[Path, str]]) -> Model:
             if viewmat is None:
                 raise UserError(report.findings[0].message)
             photos[len(photos) + 1] = Photo(prefix + frame["file_path"], key, viewmat)
-    none = np.zeros(0, np.int64)
-    return Model(lenses, photos, none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        if meta.get("ply_file_path") is not None:
+            clouds.append(_cloud(path, meta["ply_file_path"]) @ undo[:3, :3].T + undo[:3, 3])
+    xyz = np.concatenate(clouds)
+    return Model(lenses, photos, np.arange(1, len(xyz) + 1), xyz, np.full((len(xyz), 3), GREY, np.uint8))
+
+
+def _meta(path: Path) -> dict:
+    """What a transforms.json holds. Raises UserError for one without frames."""
+    try:
+        meta = json.loads(path.read_text())
+    except (ValueError, RecursionError, OSError) as err:
+        raise UserError(f"{path}: is not valid JSON ({err})") from err
+    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
+        raise UserError(f"{path}: has no list 'frames'")
+    return meta
+
+
+def _cloud(transforms: Path, name) -> np.ndarray:
+    """[N, 3] points of the PLY file that a transforms.json names, in that file's frame; at most ``MAX_POINTS``."""
+    import trimesh
+
+    path = transforms.parent / name if isinstance(name, str) else transforms
+    if path == transforms or not path.is_file():
+        raise UserError(
+            f"{transforms}: its ply_file_path {short(name)} is no file beside it; put the points there, or take the "
+            "entry out"
+        )
+    try:
+        xyz = np.asarray(getattr(trimesh.load(path, file_type="ply", process=False), "vertices", []), float)
+    except Exception as err:  # trimesh has no error of its own for a bad file
+        raise UserError(f"{path}: cannot be read as PLY ({err})") from err
+    xyz = xyz.reshape(-1, 3)
+    xyz = xyz[(np.abs(xyz) < MAX_COORDINATE).all(1)]
+    if len(xyz) > MAX_POINTS:
+        xyz = xyz[np.random.default_rng(0).choice(len(xyz), MAX_POINTS, replace=False)]
+    return xyz
 
 
 def _rigid(c2w: np.ndarray) -> np.ndarray:
@@ -158,37 +194,80 @@ def state_of(name: str, start: Path, end: Path, in_start: bool, in_end: bool) ->
 
 
 def onto_copies(model: Model, shots: list[Shot], start: Path, end: Path) -> Model:
-    """The model of the photographs that were copied: its images named, its lenses scaled to the copies' size.
+    """The model of the photographs that were copied: its images named, its lenses scaled to the copies' size. Points
+    that only other photographs observe are left out; those that none does stay, for they show the floor.
 
-    Raises UserError where fewer than two photographs of a state are found, or sizes do not belong together.
+    Raises UserError for a video, where too few photographs of a state have a pose, one has two, or sizes do not belong
+    together.
     """
+    for source in (start, end):
+        if source.is_file():
+            raise UserError(
+                f"{source}: is a video, whose frames poses cannot name; expected a folder of the frames that the poses "
+                "were solved for"
+            )
     by_file = {(s.name.split("/")[0], Path(s.source).name): s for s in shots}
-    photos, lenses = {}, {}
+    photos: dict[int, Photo] = {}
+    lenses: dict[int, Lens] = {}
+    known: dict[tuple, int] = {}
+    placed: dict[str, str] = {}
     for key, photo in model.photos.items():
         file = PurePosixPath(photo.name).name
-        there = [("start", file) in by_file, ("end", file) in by_file]
-        state = state_of(photo.name, start, end, *there)
-        if state is None:
+        # the folders and not the copies: a blurred photograph's pose is not that of its namesake
+        state = state_of(photo.name, start, end, (start / file).is_file(), (end / file).is_file())
+        if state is None or (state, file) not in by_file:
             continue
         shot, lens = by_file[state, file], model.lenses[photo.lens]
-        factor = shot.width / lens.width
-        if abs(lens.height * factor - shot.height) > 2:
+        if shot.name in placed:
             raise UserError(
-                f"{shot.source}: is {shot.width}x{shot.height} upright, its pose is for {lens.width}x{lens.height} "
-                "pixels; "
-                "solve the poses with upright photographs"
+                f"poses: {placed[shot.name]} and {photo.name} both name {shot.source}; expected one pose of each "
+                "photograph"
             )
-        params = lens.params.copy()
-        params[: 3 if lens.model in ONE_FOCAL else 4] *= factor
-        number = photo.lens * 2 + (state == "end")
-        lenses[number] = Lens(lens.model, shot.width, shot.height, params)
-        photos[key] = replace(photo, name=shot.name, lens=number, xy=photo.xy * factor)
-    for state in ("start", "end"):
-        if sum(p.name.startswith(state) for p in photos.values()) < 2:
-            folder = start if state == "start" else end
-            raise UserError(
-                f"{folder}: the poses name none or only one of its photographs; expected the same file names"
-            )
-    used = np.unique(np.concatenate([p.point[p.point >= 0] for p in photos.values()]))
-    keep = np.isin(model.ids, used)
+        # copies of one lens may have several sizes
+        number = known.setdefault((photo.lens, state, shot.width, shot.height), len(known) + 1)
+        lenses[number] = _scaled(lens, shot)
+        xy = photo.xy * (shot.width / lens.width)
+        photos[key] = replace(photo, name=shot.name, lens=number, xy=xy)
+        placed[shot.name] = photo.name
+    for state, folder in (("start", start), ("end", end)):
+        _check_share([s for s in shots if s.name.split("/")[0] == state], placed, folder)
+    observed, used = _observed(model.photos), _observed(photos)
+    keep = np.isin(model.ids, used) | ~np.isin(model.ids, observed)
     return Model(lenses, photos, model.ids[keep], model.xyz[keep], model.rgb[keep])
+
+
+def _scaled(lens: Lens, shot: Shot) -> Lens:
+    """The lens of a photograph's copy. Raises UserError where the pose was solved for a picture of another shape."""
+    factor = shot.width / lens.width
+    if abs(lens.height * factor - shot.height) > 2:
+        raise UserError(
+            f"{shot.source}: is {shot.width}x{shot.height} upright, its pose is for {lens.width}x{lens.height} pixels; "
+            "solve the poses with upright photographs"
+        )
+    params = lens.params.copy()
+    params[: 3 if lens.model in ONE_FOCAL else 4] *= factor
+    return Lens(lens.model, shot.width, shot.height, params)
+
+
+def _observed(photos: dict[int, Photo]) -> np.ndarray:
+    """Ids of the points that photographs observe."""
+    return np.unique(np.concatenate([p.point[p.point >= 0] for p in photos.values()]))
+
+
+def _check_share(shots: list[Shot], placed: Container[str], folder: Path) -> None:
+    """Raises UserError where too few of a state's photographs have a pose, as for poses that are solved here."""
+    missing = [Path(s.source).name for s in shots if s.name not in placed]
+    count = len(shots) - len(missing)
+    if count < 2:
+        raise UserError(f"{folder}: the poses name none or only one of its photographs; expected the same file names")
+    if count < MIN_SHARE * len(shots):
+        named = ", ".join(missing[:NAMED]) + (" and others" if len(missing) > NAMED else "")
+        raise UserError(
+            f"{folder}: the poses name only {count} of its {len(shots)} photographs, not {named}; expected at least "
+            f"{100 * MIN_SHARE:.0f} %: take those without a pose out of the folder, or solve the poses with all of them"
+        )
+    if count < MIN_REGISTERED:
+        raise UserError(
+            f"{folder}: the poses name {count} of its photographs, expected at least {MIN_REGISTERED}; take more, and "
+            "solve the poses with them"
+        )

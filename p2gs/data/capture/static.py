@@ -69,8 +69,8 @@ def choose(found: list[Hypothesis], given: int | None, where: Path) -> int:
     if rivals:
         raise UserError(
             f"{where}: hypotheses 0 and {rivals[0]} both reach through the room, so something large moved besides "
-            "the parts; "
-            f"leave the room as it is, or choose with --static 0 or --static {rivals[0]}"
+            "the parts; leave the room as it is, or look at hypotheses.html in the scene's folder and choose with "
+            f"--static 0 or --static {rivals[0]}"
         )
     return 0
 
@@ -120,11 +120,12 @@ def check_joint_support(model: Model) -> dict:
     """Where the points lie that both states show, for poses that somebody else solved. Raises UserError where they are
     confined.
 
-    A model without points says nothing, and neither does this.
+    A model whose points no photograph observes says nothing, and neither does this.
     """
-    if len(model.ids) == 0:
+    seen = states_of(model)
+    if not seen.any():
         return {"points": 0}
-    rows = np.flatnonzero(states_of(model).all(1))
+    rows = np.flatnonzero(seen.all(1))
     if len(rows) < MIN_VOTES:
         raise UserError(
             f"the poses' two states share {len(rows)} points, expected at least {MIN_VOTES}: they need not lie in "

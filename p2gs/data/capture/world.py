@@ -1,5 +1,5 @@
-"""The joint model brought into the scene's world: up, the floor at 0, metres where something says how long they are,
-and the object's box."""
+"""The joint model brought into the scene's world: up, the floor at 0 (where nothing shows it, the object's lowest
+point), metres where something says how long they are, and the object's box."""
 
 from __future__ import annotations
 
@@ -15,9 +15,13 @@ from p2gs.data.capture.joint import is_end
 from p2gs.data.capture.model import Model
 from p2gs.types import UserError
 
+UNKNOWN = "unknown"  # the floor: nothing says where it is
+
 
 def oriented(model: Model, corners: dict[int, int]) -> tuple[Model, dict]:
-    """The model with z up, the floor at 0 and, where there is a board, in metres; what was used for it."""
+    """The model with z up, the floor at 0 (``UNKNOWN``: what the cameras look at) and, where there is a board, in
+    metres; what was used for it, as capture.json has it: scale, up and floor (board, floor plane, lowest points or
+    ``UNKNOWN``)."""
     floor, pose = frame.floor_of(model), marker_board.board_pose(model, corners)
     metres, source, about = 1.0, "object diagonal", {}
     if pose is not None:
@@ -29,7 +33,20 @@ def oriented(model: Model, corners: dict[int, int]) -> tuple[Model, dict]:
         if normal @ floor.normal < np.cos(np.radians(5)) or floor.source == "cameras":
             floor = frame.Floor(normal, float(normal @ T[:3, 3]), "board")
         about["board_rms_mm"] = round(1000 * rms, 2)
-    return model.moved(frame.to_world(floor, model, metres)), about | {"scale": {"source": source}, "up": floor.source}
+    about |= {"scale": {"source": source}, "up": floor.source, "floor": floor.source}
+    if floor.source == "cameras":
+        about["floor"] = UNKNOWN if floor.height is None else "lowest points"
+    return model.moved(frame.to_world(floor, model, metres)), about
+
+
+def check_floor(about: dict, poses: Path) -> None:
+    """Raises UserError where masks are to come from 3D and nothing says where the floor is, which they cut the object
+    off at. about: of ``oriented``.  poses: where the model is from."""
+    if about["floor"] == UNKNOWN:
+        raise UserError(
+            f"{poses}: has no points, so nothing says where the floor is that automatic masks end at; give --masks "
+            "DIR, or poses with points (a COLMAP model, or a transforms.json with ply_file_path)"
+        )
 
 
 def given_box(box: Optional[tuple[float, ...]], about: dict, out: Path) -> Optional[np.ndarray]:
@@ -52,21 +69,27 @@ def given_box(box: Optional[tuple[float, ...]], about: dict, out: Path) -> Optio
 
 
 def scaled(model: Model, masks: dict[str, np.ndarray], height: Optional[float], about: dict) -> Model:
-    """The model with the object's height, or else its diagonal of 1, where no board gave metres; notes it in
-    ``about``."""
-    scale = about["scale"]
+    """The model with the object's height [m], or else its diagonal of 1, where no board gave metres, and with the
+    object's lowest point at 0 where the floor is not known; notes it in ``about`` (of ``oriented``)."""
+    scale, known = about["scale"], about["floor"] != UNKNOWN
     if scale["source"] != "board":
-        box = box_of(model, masks)
+        box = box_of(model, masks, known)
+        bottom = 0.0 if known else float(box[0, 2])
         factor = 1 / float(np.linalg.norm(box[1] - box[0]))
         if height is not None:
-            factor, scale["source"] = height / float(box[1, 2]), "height"
-        model, scale["factor"] = model.moved(np.diag([factor, factor, factor, 1.0])), factor
+            factor, scale["source"] = height / (float(box[1, 2]) - bottom), "height"
+        T = np.diag([factor, factor, factor, 1.0])
+        T[2, 3] = -factor * bottom
+        model, scale["factor"] = model.moved(T), factor
     scale["metric"] = scale["source"] != "object diagonal"
     return model
 
 
-def box_of(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
-    """[2, 3] corners of the object by its masks, in the model's coordinates (floor at z = 0)."""
+def box_of(model: Model, masks: dict[str, np.ndarray], floor: bool = True) -> np.ndarray:
+    """[2, 3] corners of the object by its masks, in the model's coordinates. floor: nothing lies below z = 0.
+
+    Raises UserError where the object lies below the floor, or the masks show no common object.
+    """
     import cv2
     import torch
 
@@ -83,5 +106,12 @@ def box_of(model: Model, masks: dict[str, np.ndarray]) -> np.ndarray:
             View(photo.name, int(is_end(photo.name)), "train", camera, torch.empty(0), torch.from_numpy(alpha))
         )
     box = object_box(views).double().numpy()
+    if not floor:
+        return box
+    if box[1, 2] <= 0:
+        raise UserError(
+            "the masks show the object below the floor that the points show; expected masks of what stands on it, and "
+            "poses of these photographs"
+        )
     box[0, 2] = max(box[0, 2], 0.0)  # the hull of photographs from above goes on below the floor
     return box
