@@ -46,10 +46,12 @@ ALIKE = [(state, f"a{i}.{kind}") for state in ("start", "end") for i in range(5)
 @pytest.mark.parametrize("sources", [NUMBERED, FRAMES, ALIKE], ids=["numbered", "a video", "same stems"])
 def test_masks_are_found_again_by_their_photographs(sources, tmp_path):
     mine = shots(*sources)
-    made = kept_masks(Cache(tmp_path / ".capture"), tmp_path / "masks", mine, 1, lambda: drawn(mine), print)
+    masks = drawn(mine)
+    del masks["end/0008.jpg"]  # of a photograph that could not be placed
+    made = kept_masks(Cache(tmp_path / ".capture"), tmp_path / "masks", mine, 1, lambda: masks, print)
     found = folder_masks(mine, tmp_path / "masks")
-    assert made.keys() == found.keys() == {s.name for s in mine}
-    for name, mask in drawn(mine).items():
+    assert made.keys() == found.keys() == {s.name for s in mine} - {"end/0008.jpg"}
+    for name, mask in masks.items():
         np.testing.assert_array_equal(found[name], mask)
         np.testing.assert_array_equal(made[name], mask)
     assert len(set(mask_names(mine).values())) == len(mine)

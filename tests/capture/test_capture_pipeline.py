@@ -14,6 +14,7 @@ import torch
 from p2gs.app import run
 from p2gs.data.capture.child import run_job
 from p2gs.data.capture.colmap_io import read_model, write_model
+from p2gs.data.capture.hull import agreement
 from p2gs.data.capture.model import Lens, Model, Photo
 from p2gs.data.capture.static import loose_poses
 from p2gs.data.check import check_dataset
@@ -22,7 +23,7 @@ from p2gs.data.generated.shapes import box
 from p2gs.data.generated.synthetic import look_at
 from p2gs.data.generated.textures import Texture
 from p2gs.scores.capture import camera_pairs, moved_joint, rigid_between
-from p2gs.types import Joint, UserError
+from p2gs.types import Camera, Joint, UserError
 
 LENS = Lens("PINHOLE", 320, 240, np.array([280.0, 280, 160, 120]))
 
@@ -107,6 +108,26 @@ def test_pictures_are_windows_about_the_object(capture, tmp_path):
         middle = lens.K[:2, 2] / [lens.width, lens.height]
         assert np.abs(middle - 0.5).max() < 0.02
         assert lens.width < whole.width and lens.height < whole.height
+
+
+def test_a_mask_of_another_thing_is_told_from_the_others():
+    """Of thirty outlines of a box one is of something beside it; the others are the box's own."""
+    low, high = np.array([-0.3, -0.2, 0.0]), np.array([0.3, 0.2, 0.7])
+    corners = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.2, 0.2) for z in (0.0, 0.7)])
+    outlines = []
+    for i, angle in enumerate(np.linspace(0, 2 * np.pi, 30, endpoint=False)):
+        view = look_at(np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), (0.4, 1.2, 2.2)[i % 3]]), (0, 0, 0.35))
+        camera = Camera(torch.tensor(view).float(), torch.tensor(LENS.K).float(), LENS.width, LENS.height)
+        pixels = LENS.project(corners @ view[:3, :3].T + view[:3, 3])
+        drawn = cv2.fillConvexPoly(np.zeros((240, 320), np.uint8), cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
+        outlines.append((camera, drawn > 0))
+    wider = np.stack([low - 0.1, high + 0.1])
+    assert min(agreement(outlines, wider)) > 0.85
+    other = np.zeros((240, 320), bool)
+    other[200:, :60] = True
+    outlines[7] = outlines[7][0], other
+    shares = agreement(outlines, wider)
+    assert shares[7] == 0 and min(shares[:7] + shares[8:]) > 0.85
 
 
 def test_a_folder_of_something_else_is_not_written_into(capture, tmp_path, capsys):

@@ -57,13 +57,8 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
     points = np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)
     above = (points @ region.planes[:, :3].T - region.planes[:, 3]).min(1)
     free = np.flatnonzero((above > 0) & (region.box is None or region.holds(points)))
-    seen, inside = np.zeros(len(free)), np.zeros(len(free))
-    for camera, outline in outlines:
-        x, y, _, shown = _projected(points[free], camera)
-        seen += shown
-        inside[shown] += outline[y[shown], x[shown]]
     solid = np.zeros(len(points), bool)
-    solid[free] = (seen >= FEWEST) & (inside >= IN_HULL * seen)
+    solid[free], seen = in_common(points[free], outlines)
     bodies = np.asarray(label(solid.reshape([len(s) for s in sides]), np.ones((3, 3, 3)))[0], np.int64).ravel()  # type: ignore[index]
     away = np.linalg.norm(points - region.centre, axis=1) / region.distance
     weight = np.bincount(bodies, np.exp(-((away / MIDDLE) ** 2)))
@@ -75,6 +70,31 @@ def hull_of(region: Region, outlines: list[tuple[Camera, np.ndarray]]) -> Hull:
     kept = (lowest > step) & (looks > len(outlines) / 2)  # a cell of air beneath
     kept[weight.argmax()], kept[0] = True, False
     return Hull(points[kept[bodies]], step)
+
+
+def in_common(points: np.ndarray, outlines: list[tuple[Camera, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Of points [N, 3]: which lie within nearly all outlines (camera and [h, w] bool) that can show them, and how many
+    can."""
+    seen, inside = np.zeros(len(points)), np.zeros(len(points))
+    for camera, outline in outlines:
+        x, y, _, shown = _projected(points, camera)
+        seen += shown
+        inside[shown] += outline[y[shown], x[shown]]
+    return (seen >= FEWEST) & (inside >= IN_HULL * seen), seen
+
+
+def agreement(outlines: list[tuple[Camera, np.ndarray]], box: np.ndarray, cells: int = 48) -> list[float]:
+    """Of each outline the share (intersection over union) that it has in common with the body that nearly all of them
+    show within ``box`` [2, 3]: about 1 where they are of one thing. cells: along the box's longest side."""
+    step = float((box[1] - box[0]).max()) / cells
+    sides = [np.arange(a + step / 2, b, step) for a, b in zip(*box, strict=True)]
+    points = np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)
+    body = Hull(points[in_common(points, outlines)[0]], step)
+    out = []
+    for camera, outline in outlines:
+        drawn = body.outline(camera)
+        out.append(float((drawn & outline).sum() / max((drawn | outline).sum(), 1)))
+    return out
 
 
 def _projected(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

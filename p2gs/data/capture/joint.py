@@ -8,7 +8,7 @@ x 60 pairs of photographs cost minutes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,31 +73,43 @@ def guided_pairs(start: State, end: State, T: np.ndarray) -> np.ndarray:
     return pairs[(alike == best_a[pairs[:, 0]]) & (alike == best_b[pairs[:, 1]])]
 
 
-def merged(start: Model, end: Model, T: np.ndarray, pairs: np.ndarray) -> Model:
+def _shared_lenses(start: Model, end: Model, lens_of: Mapping[str, Hashable] | None) -> dict[int, int]:
+    """{end's lens: start's lens} for those that are one, see ``merged``."""
+
+    def kind(model: Model, key: int) -> tuple:
+        lens = model.lenses[key]
+        names = [photo.name for photo in model.photos.values() if photo.lens == key]
+        taken_with = None if lens_of is None else frozenset(lens_of[name] for name in names)
+        return lens.width, lens.height, lens.model, taken_with
+
+    known = {kind(start, key): key for key in reversed(start.lenses)}  # of several alike the first
+    return {key: known[kind(end, key)] for key in end.lenses if kind(end, key) in known}
+
+
+def merged(
+    start: Model, end: Model, T: np.ndarray, pairs: np.ndarray, lens_of: Mapping[str, Hashable] | None = None
+) -> Model:
     """One model in the start's frame. T: [4, 4] start -> end.  pairs: [M, 2] rows of start's and end's points that are
     one.
 
-    Photographs of the end state that share device and size with the start's share its lens from here on.
+    Photographs of the end state that were taken with the start's lens share it from here on. lens_of: what each
+    photograph was taken with, by name; None: lenses of one size and model are one.
     """
     end = end.moved(np.linalg.inv(T))
     offset = int(start.ids.max(initial=0)) + 1
     new_id = end.ids + offset
     new_id[pairs[:, 1]] = start.ids[pairs[:, 0]]
-    lenses, lens_of = dict(start.lenses), {}
-    for key, lens in end.lenses.items():
-        same = [
-            k
-            for k, other in start.lenses.items()
-            if (other.width, other.height, other.model) == (lens.width, lens.height, lens.model)
-        ]
-        lens_of[key] = same[0] if same else max(lenses) + 1
-        lenses.setdefault(lens_of[key], lens)
+    lenses, shared = dict(start.lenses), _shared_lenses(start, end, lens_of)
+    for key in end.lenses:
+        if key not in shared:
+            shared[key] = max(lenses) + 1
+            lenses[shared[key]] = end.lenses[key]
     photos = dict(start.photos)
     for key, photo in end.photos.items():
         point = np.where(
             photo.point >= 0, new_id[np.searchsorted(end.ids, np.maximum(photo.point, end.ids.min(initial=0)))], -1
         )
-        photos[key + END_OFFSET] = replace(photo, lens=lens_of[photo.lens], point=point)
+        photos[key + END_OFFSET] = replace(photo, lens=shared[photo.lens], point=point)
     own = np.setdiff1d(np.arange(len(end.ids)), pairs[:, 1])
     xyz = start.xyz.copy()
     xyz[pairs[:, 0]] = (start.xyz[pairs[:, 0]] + end.xyz[pairs[:, 1]]) / 2
@@ -163,6 +175,7 @@ def join(
     by_pixels: Callable[[Model], Model],
     progress: Callable[[str], None] = lambda text: None,
     by_board: bool = False,
+    lens_of: Mapping[str, Hashable] | None = None,
 ) -> Model:
     """One adjusted model of both states, of the photographs that are placed surely.
 
@@ -171,13 +184,14 @@ def join(
     there, so that they calibrate the lens (Zhang 2000, DOI 10.1109/34.888718), which a flat front cannot tell from a
     bent one.  by_pixels: puts observations where the pixels say, given cameras that are nearly right.  by_board:
     nothing but the board says T. Then no other point joins the states (a door moves little beside its hinge, and would
-    hold the open state there), and lenses' middles stay where they are unless ``measured`` places points.
+    hold the open state there), and lenses' middles stay where they are unless ``measured`` places points.  lens_of: see
+    ``merged``.
     """
     model, known = None, []
     for turn in range(ROUNDS):
         pairs = np.zeros((0, 2), np.int64) if by_board else guided_pairs(start, end, T)
         progress(f"{len(pairs)} points seen in both states")
-        model = extra(merged(start.model, end.model, T, pairs))
+        model = extra(merged(start.model, end.model, T, pairs, lens_of))
         model = filtered(model, MAX_ERROR * (4 if turn == 0 else 2))
         model = filtered(adjusted(model, folder, False, progress))
         model, known = measured(model)

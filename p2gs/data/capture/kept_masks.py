@@ -46,8 +46,8 @@ def check_unedited(cache: Cache, folder: Path) -> None:
 def kept_masks(
     cache: Cache, folder: Path, shots: list[Shot], depends: object, make: Callable[[], Masks], progress: Progress
 ) -> Masks:
-    """The masks [H, W] uint8 by copy's name, from ``folder`` where what they depend on is unchanged, else made and
-    written there."""
+    """The masks [H, W] uint8 by copy's name, of photographs that show the object, from ``folder`` where what they
+    depend on is unchanged, else made and written there."""
     import cv2
 
     names, before = mask_names(shots), cache.kept("masks")
@@ -56,7 +56,8 @@ def kept_masks(
         masks, files = make(), {}
         for file in {} if before is None else before["result"]:
             (folder / file).unlink(missing_ok=True)
-        for name, mask in masks.items():
+        for shot in shots:  # a photograph without a mask has a black one, so that the folder can be given back
+            name, mask = shot.name, masks.get(shot.name, np.zeros((shot.height, shot.width), np.uint8))
             path = folder / names[name]
             path.parent.mkdir(parents=True, exist_ok=True)
             if not cv2.imwrite(str(path), mask):
@@ -69,5 +70,6 @@ def kept_masks(
     for file in files:
         mask = cv2.imread(str(folder / file), cv2.IMREAD_GRAYSCALE)
         assert mask is not None  # its bytes are those that were written
-        out[copies[file]] = mask
+        if mask.any():
+            out[copies[file]] = mask
     return out

@@ -99,6 +99,9 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     progress("writing")
     files = write.write_scene(model, work / "photos", masks, found, out)
     box = world.box_of(model, masks)
+    for name, share in world.odd_masks(model, masks, box).items() if source in ("given", "alpha") else ():
+        file = next(s.source for s in shots if s.name == name)
+        progress(f"warning: {file}: {100 * share:.0f} % of its mask is what the other masks show; look at contact.jpg")
     placed = {p.name for p in model.photos.values()}
     unused = {True: "its mask is empty", False: "could not be placed among the others"}
     left_out |= {s.name: (s.source, unused[s.name in placed]) for s in shots if s.name not in masks}
@@ -125,7 +128,7 @@ def _photos(sources: dict[str, Path], work: Path, cache: Cache, options: Options
                 ]
             }
 
-        depends = [_stamp(source), options.size, options.max_views]
+        depends = ["edges measured", _stamp(source), options.size, options.max_views]
 
         def whole(result: dict) -> bool:
             return all((work / "photos" / s["name"]).is_file() for s in result["shots"])

@@ -105,10 +105,12 @@ def solved(
         progress(f"{100 * share:.0f} % of the features placed by their pixels")
         return model
 
-    joined = partial(join, *states, chosen.T, work / "joint", with_board, on_board, by_pixels, progress)
+    lenses = {s.name: s.lens for s in shots}
+    folder, steps = work / "joint", (with_board, on_board, by_pixels, progress)
+    joined = partial(join, states[0], states[1], chosen.T, folder, *steps, lens_of=lenses)
     # the name is what this stage is: what an earlier build kept had other numbers for the board's points
     sightings = [sorted((k, v.tolist()) for k, v in m.items()) for m in seen.values()]
-    depends = ["placed by pixels", chosen.T.tolist(), sightings]
+    depends = ["placed by pixels", chosen.T.tolist(), sightings, sorted(lenses.items())]
 
     def make() -> dict:
         model = joined(by_board=bool(chosen.board) and not chosen.wide)

@@ -3,6 +3,7 @@ stays."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,9 @@ from p2gs.types import UserError
 LOOKED_AT = 3  # frames per kept one: a shaken hand is still somewhere in a stretch
 
 
-def sharp_frames(path: Path, count: int) -> list[tuple[float, np.ndarray]]:
-    """(time in seconds, upright RGB [H, W, 3]) of ``count`` frames. Raises UserError where the video cannot be read or
-    is too short."""
+def sharp_frames(path: Path, count: int) -> Iterator[tuple[float, np.ndarray]]:
+    """(time in seconds, upright RGB [H, W, 3] uint8) of ``count`` frames, one after the other: sixty of a 4K video
+    together would take 1.5 GB. Raises UserError where the video cannot be read or is too short."""
     import cv2
 
     video = cv2.VideoCapture(str(path))
@@ -26,18 +27,23 @@ def sharp_frames(path: Path, count: int) -> list[tuple[float, np.ndarray]]:
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
     bins = np.linspace(0, total, min(count, total) + 1)
     step = max(int((bins[1] - bins[0]) / LOOKED_AT), 1)
-    best: dict[int, tuple[float, int, np.ndarray]] = {}
-    index = 0
+    best: tuple[int, float, int, np.ndarray] | None = None  # stretch, sharpness, index, frame
+    index, given = 0, 0
     while video.grab():
-        if index % step == 0:
-            good, frame = video.retrieve()
-            if good:
-                which = min(int(np.searchsorted(bins, index, side="right")) - 1, len(bins) - 2)
-                score = sharpness(frame)
-                if which not in best or score > best[which][0]:
-                    best[which] = (score, index, np.ascontiguousarray(frame[..., ::-1]))
+        frame = video.retrieve()[1] if index % step == 0 else None
+        if frame is not None:
+            which = min(int(np.searchsorted(bins, index, side="right")) - 1, len(bins) - 2)
+            if best is not None and best[0] != which:
+                yield best[2] / rate, best[3]
+                best, given = None, given + 1
+            frame = np.ascontiguousarray(frame[..., ::-1])
+            score = sharpness(frame)
+            if best is None or score > best[1]:
+                best = (which, score, index, frame)
         index += 1
     video.release()
-    if len(best) < MIN_PHOTOS:
-        raise UserError(f"{path}: only {len(best)} frames could be read, expected at least {MIN_PHOTOS}")
-    return [(best[k][1] / rate, best[k][2]) for k in sorted(best)]
+    if best is not None:
+        yield best[2] / rate, best[3]
+        given += 1
+    if given < MIN_PHOTOS:
+        raise UserError(f"{path}: only {given} frames could be read, expected at least {MIN_PHOTOS}")

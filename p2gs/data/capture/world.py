@@ -13,7 +13,7 @@ from p2gs.data.capture import board as marker_board
 from p2gs.data.capture import frame, write
 from p2gs.data.capture.joint import is_end
 from p2gs.data.capture.model import Model
-from p2gs.types import UserError
+from p2gs.types import Camera, UserError
 
 UNKNOWN = "unknown"  # the floor: nothing says where it is
 
@@ -90,21 +90,15 @@ def box_of(model: Model, masks: dict[str, np.ndarray], floor: bool = True) -> np
 
     Raises UserError where the object lies below the floor, or the masks show no common object.
     """
-    import cv2
     import torch
 
     from p2gs.data.box import object_box
-    from p2gs.types import Camera, View
+    from p2gs.types import View
 
-    views = []
-    for photo in (p for p in model.photos.values() if p.name in masks):
-        lens = model.lenses[photo.lens]
-        pinhole = write.pinhole_of(lens)
-        alpha = cv2.remap(masks[photo.name], pinhole.maps[0], pinhole.maps[1], cv2.INTER_NEAREST)
-        camera = Camera(torch.tensor(photo.viewmat).float(), torch.tensor(pinhole.K).float(), lens.width, lens.height)
-        views.append(
-            View(photo.name, int(is_end(photo.name)), "train", camera, torch.empty(0), torch.from_numpy(alpha))
-        )
+    views = [
+        View(name, int(is_end(name)), "train", camera, torch.empty(0), torch.from_numpy(alpha))
+        for name, (camera, alpha) in undistorted(model, masks).items()
+    ]
     box = object_box(views).double().numpy()
     if not floor:
         return box
@@ -115,3 +109,38 @@ def box_of(model: Model, masks: dict[str, np.ndarray], floor: bool = True) -> np
         )
     box[0, 2] = max(box[0, 2], 0.0)  # the hull of photographs from above goes on below the floor
     return box
+
+
+def undistorted(model: Model, masks: dict[str, np.ndarray]) -> dict[str, tuple[Camera, np.ndarray]]:
+    """Each mask [H, W] uint8 as a pinhole camera would have it, and that camera, by photograph's name."""
+    import cv2
+    import torch
+
+    out, pinholes = {}, {key: write.pinhole_of(lens) for key, lens in model.lenses.items()}
+    for photo in (p for p in model.photos.values() if p.name in masks):
+        lens, pinhole = model.lenses[photo.lens], pinholes[photo.lens]
+        alpha = cv2.remap(masks[photo.name], pinhole.maps[0], pinhole.maps[1], cv2.INTER_NEAREST)
+        viewmat, K = torch.tensor(photo.viewmat).float(), torch.tensor(pinhole.K).float()
+        out[photo.name] = Camera(viewmat, K, lens.width, lens.height), alpha
+    return out
+
+
+def odd_masks(model: Model, masks: dict[str, np.ndarray], box: np.ndarray) -> dict[str, float]:
+    """Photographs whose mask shows another thing than the others of their state do, and the share that it has in common
+    with what those show (``hull.agreement``).  box: [2, 3], the object's."""
+    import cv2
+
+    from p2gs.data.capture.auto_masks import ALIKE, COARSE
+    from p2gs.data.capture.hull import agreement
+
+    odd: dict[str, float] = {}
+    for end in (False, True):
+        outlines = {}
+        for name, (camera, alpha) in undistorted(model, masks).items():
+            if is_end(name) == end:
+                factor = min(1.0, COARSE / max(camera.width, camera.height))
+                size = (round(camera.width * factor), round(camera.height * factor))
+                outlines[name] = camera.scaled(*size), cv2.resize(alpha, size, interpolation=cv2.INTER_AREA) > 127
+        shares = agreement(list(outlines.values()), box)
+        odd |= {name: share for name, share in zip(outlines, shares, strict=True) if share < ALIKE}
+    return odd
