@@ -145,6 +145,22 @@ def test_what_was_copied_and_is_gone_is_copied_again(tmp_path, capsys):
     assert len(list((out / ".capture/photos/end").glob("*.jpg"))) == 9
 
 
+def test_photographs_that_cannot_be_placed_are_named(tmp_path, capsys):
+    pytest.importorskip("pycolmap")
+    from p2gs.app import run
+
+    for state in ("a", "b"):
+        (tmp_path / state).mkdir()
+        for i in range(9):
+            image = np.random.default_rng(i).integers(0, 255, (60, 80, 3), np.uint8)
+            cv2.imwrite(
+                str(tmp_path / state / f"{i}.png"), cv2.resize(image, (320, 240), interpolation=cv2.INTER_NEAREST)
+            )
+    words = ["data", "capture", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "scene")]
+    assert run([*words, "--careful"]) == 2
+    assert "only 0 of 9 photographs could be placed, not 0.png, 1.png, 2.png and others" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [

@@ -254,6 +254,11 @@ def _observed(photos: dict[int, Photo]) -> np.ndarray:
     return np.unique(np.concatenate([p.point[p.point >= 0] for p in photos.values()]))
 
 
+def some_of(names: list[str]) -> str:
+    """The first few of photographs' names, for a sentence."""
+    return ", ".join(names[:NAMED]) + (" and others" if len(names) > NAMED else "")
+
+
 def _check_share(shots: list[Shot], placed: Container[str], folder: Path) -> None:
     """Raises UserError where too few of a state's photographs have a pose, as for poses that are solved here."""
     missing = [Path(s.source).name for s in shots if s.name not in placed]
@@ -261,10 +266,10 @@ def _check_share(shots: list[Shot], placed: Container[str], folder: Path) -> Non
     if count < 2:
         raise UserError(f"{folder}: the poses name none or only one of its photographs; expected the same file names")
     if count < MIN_SHARE * len(shots):
-        named = ", ".join(missing[:NAMED]) + (" and others" if len(missing) > NAMED else "")
         raise UserError(
-            f"{folder}: the poses name only {count} of its {len(shots)} photographs, not {named}; expected at least "
-            f"{100 * MIN_SHARE:.0f} %: take those without a pose out of the folder, or solve the poses with all of them"
+            f"{folder}: the poses name only {count} of its {len(shots)} photographs, not {some_of(missing)}; "
+            f"expected at least {100 * MIN_SHARE:.0f} %: take those without a pose out of the folder, or solve the "
+            "poses with all of them"
         )
     if count < MIN_REGISTERED:
         raise UserError(

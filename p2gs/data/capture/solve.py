@@ -18,7 +18,7 @@ from p2gs.data.capture.hypotheses import Hypothesis, State
 from p2gs.data.capture.joint import join
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, lens_groups
-from p2gs.data.capture.poses import MIN_REGISTERED, MIN_SHARE
+from p2gs.data.capture.poses import MIN_REGISTERED, MIN_SHARE, some_of
 from p2gs.data.capture.static import LINKED, check_link, choose, hypotheses_of, link
 from p2gs.types import UserError
 
@@ -41,7 +41,7 @@ def _reconstructed(state: str, shots: list[Shot], work: Path, cache: Cache, care
     do."""
     from p2gs.data.capture.sfm import default_effort
 
-    total, result = len(shots), {"registered": 0, "models": 0}
+    total, result, name = len(shots), {"registered": 0, "models": 0}, state
     for effort in [True] if careful else [False, True]:
         name = f"{state}_careful" if effort else state
         job = {
@@ -61,9 +61,11 @@ def _reconstructed(state: str, shots: list[Shot], work: Path, cache: Cache, care
             model = read_model(work / name / "model")
             d = np.load(work / name / "descriptors.npz")["descriptors"].astype(np.float32)
             return State(model, d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-6))
+    placed = {p.name for p in read_model(work / name / "model").photos.values()} if result["registered"] else set()
+    missing = some_of([Path(s.source).name for s in shots if s.name not in placed])
     raise UserError(
-        f"{Path(shots[0].source).parent}: only {result['registered']} of {total} photographs could be placed; "
-        "take them closer together (a step to the side each), with the room in view, "
+        f"{Path(shots[0].source).parent}: only {result['registered']} of {total} photographs could be placed, not "
+        f"{missing}; take them closer together (a step to the side each), with the room in view, "
         "and lay newspapers or a patterned rug around the object"
     )
 
