@@ -206,8 +206,16 @@ def parser(prog: str = "p2gs") -> Parser:
     capture.add_argument(
         "--static", type=int, metavar="N", help="which of hypotheses.html is the room (default: the widest)"
     )
-    capture.add_argument(
+    size = capture.add_mutually_exclusive_group()
+    size.add_argument(
         "--height", type=float, metavar="M", help="height of the object in metres, where there is no board"
+    )
+    size.add_argument(
+        "--length",
+        type=float,
+        nargs=7,
+        metavar=("M", "X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="metres between two places, likewise; click them in SCENE/capture.html",
     )
     capture.add_argument(
         "--box",

@@ -128,11 +128,14 @@ def capture(args: argparse.Namespace) -> int:
             raise UserError(f"data capture: {name} is {getattr(args, name)}, expected at least 8")
     if args.height is not None and not 0 < args.height < float("inf"):
         raise UserError(f"data capture: --height is {args.height:g}, expected metres above 0")
+    if args.length is not None and not 0 < args.length[0] < float("inf"):
+        raise UserError(f"data capture: --length is {args.length[0]:g}, expected metres above 0")
     if args.poses is not None and args.static is not None:
         raise UserError("data capture: --static chooses how the states lie to one another, which --poses says already")
     options = Options(
         masks=None if args.masks is None else Path(args.masks), ignore=args.mask_means == "ignore",
         poses=None if args.poses is None else Path(args.poses), static=args.static, height=args.height,
+        length=None if args.length is None else tuple(args.length),
         box=None if args.box is None else tuple(args.box), mask_model=args.mask_model,
         max_views=args.max_views, size=args.size, careful=args.careful,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from p2gs.data.capture.coarse import Region, _cloud, object_rows
 from p2gs.data.capture.hull import hull_of
 from p2gs.data.capture.model import Lens, Model, Photo
 from p2gs.data.capture.page import CLICKS, _plan, write_page
-from p2gs.data.capture.world import given_box
+from p2gs.data.capture.world import given_box, given_length
 from p2gs.data.generated.synthetic import look_at
 from p2gs.types import Camera, UserError
 
@@ -48,8 +48,12 @@ for (const c of {json.dumps(clicks)}) {{
   if (done[0] || !done[1]) throw Error('two clicks make a box');
 }}
 console.log(option());
+console.log(length());
 """
     out = subprocess.run(["node", "-e", script], capture_output=True, text=True, timeout=60, check=True).stdout
+    out, ends = out.splitlines()
+    assert ends.startswith("--length M ")  # the corners as they were clicked: high first
+    assert np.abs(np.array(ends.split()[2:], float).reshape(2, 3) - BOX[::-1]).max() < 0.002
     assert out.startswith("--box ")
     assert np.abs(np.array(out.split()[1:], float).reshape(2, 3) - BOX).max() < 0.002  # a tenth of a pixel of the plan
 
@@ -69,6 +73,12 @@ def test_the_box_is_in_units_of_the_page(tmp_path):
         given_box(numbers, object_, tmp_path)
     (tmp_path / "capture.json").write_text(json.dumps({"scale": {"factor": 2.0}}))
     assert np.allclose(given_box(numbers, object_, tmp_path), BOX / 2)
+    assert given_length((3.0, 0, 0, 0, 0, 0, 4), object_, tmp_path) == pytest.approx(1.5)  # two units of the model
+    (tmp_path / "capture.json").write_text(json.dumps({"scale": {"factor": 5.0}}))  # of the scene with that box
+    assert np.allclose(given_box(numbers, object_, tmp_path), BOX / 2)  # the same command again
+    assert given_length((3.0, 0, 0, 0, 0, 0, 4), object_, tmp_path) == pytest.approx(1.5)
+    assert np.allclose(given_box(tuple(2 * BOX.ravel()), object_, tmp_path), 2 * BOX / 5)  # read off the new page
+    assert given_length((3.0, 0, 0, 0, 0, 0, 4), board, tmp_path) == pytest.approx(0.75)
     with pytest.raises(UserError, match="each first below its second"):
         given_box(numbers[::-1], board, tmp_path)
 

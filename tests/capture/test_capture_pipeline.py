@@ -91,6 +91,25 @@ def test_poses_and_masks_become_a_scene(capture, tmp_path, capsys):
     assert "photos_start: unchanged" in capsys.readouterr().out
 
 
+def test_a_known_length_gives_metres_whenever_the_command_is_given(capture, tmp_path, capsys):
+    """The poses are in metres, so the scene's factor is 1: of the second run, too, whose page has other units."""
+    out, masks = tmp_path / "scene", ["--masks", str(capture / "masks")]
+    assert command(capture, out, *masks, "--length", "1", *"000100") == 2
+    assert "run without --length first" in capsys.readouterr().err
+    assert command(capture, out, *masks, "--length", "1", *"100100") == 2
+    assert "both ends are one place" in capsys.readouterr().err
+    assert command(capture, out, *masks) == 0
+    unit = json.loads((out / "capture.json").read_text())["scale"]["factor"]
+    assert unit != pytest.approx(1, rel=0.05)
+    ends = [0.1, 0.2, 0.0, 0.1 + 1.2 * unit, 0.2 + 1.6 * unit, 0.0]  # two metres apart
+    for _ in range(2):
+        assert command(capture, out, *masks, "--length", "2", *map(str, ends)) == 0
+        scale = json.loads((out / "capture.json").read_text())["scale"]
+        assert scale["source"] == "length" and scale["metric"] and scale["factor"] == pytest.approx(1)
+    assert run(["data", "capture", "a", "b", "--out", "c", "--height", "1", "--length", "1", *"000100"]) == 2
+    assert "not allowed with" in capsys.readouterr().err
+
+
 def test_pictures_are_windows_about_the_object(capture, tmp_path):
     out = tmp_path / "scene"
     assert command(capture, out, "--masks", str(capture / "masks")) == 0

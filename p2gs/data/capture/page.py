@@ -16,7 +16,7 @@ from p2gs.data.capture.model import Model
 
 # Two clicks on a plan are two corners: the box of both plans, as an option of ``p2gs data capture``.
 CLICKS = """
-const box = JSON.parse(document.getElementById('box').dataset.box), at = {};
+const box = JSON.parse(document.getElementById('box').dataset.box), at = {}, ends = {};
 function place(plan, x, y) {  // of a pixel of the plan, in the scene
   const size = Number(plan.dataset.size);
   return [(x - 300) / 290 * size, (300 - y) / 290 * size];
@@ -28,13 +28,22 @@ function clicked(plan, x, y) {  // whether a box came of it
     box[0][axis] = Math.min(at[name][i], here[i]);
     box[1][axis] = Math.max(at[name][i], here[i]);
   });
+  ends[name] = [at[name], here];
   delete at[name];
   return true;
 }
 function option() { return '--box ' + box.flat().map(v => v.toFixed(4)).join(' '); }
+function length() {  // the two places as they were clicked; from above alone they are of one height
+  const of = [[0, 0, 0], [0, 0, 0]];
+  for (const name in ends)
+    name.split(',').map(Number).forEach((axis, i) => ends[name].forEach((end, k) => { of[k][axis] = end[i]; }));
+  return '--length M ' + of.flat().map(v => v.toFixed(4)).join(' ');
+}
 document.querySelectorAll('svg').forEach(plan => plan.addEventListener('click', event => {
   const p = new DOMPoint(event.clientX, event.clientY).matrixTransform(plan.getScreenCTM().inverse());
-  if (clicked(plan, p.x, p.y)) document.getElementById('box').textContent = option();
+  if (!clicked(plan, p.x, p.y)) return;
+  document.getElementById('box').textContent = option();
+  document.getElementById('length').textContent = length();
 }));
 """
 # of points: whether they lie on the object, whether both states show them at one place
@@ -164,7 +173,9 @@ def write_page(scene: Path, model: Model, masks: dict[str, np.ndarray], box: np.
 {_plan(model, colours, (0, 2), "from the side", box)}<ul>{legend}<li style="color:#090">the object's box</li></ul>
 <p>Masks of the wrong thing? Click two opposite corners of the object in each picture above, wide enough for both
 states, and run the same command with <code id="box" data-box="{corners}">{option}</code> (now: the box that was
-found).</p>
+found).</p><p>Is a length known (a rug, the object's width)? Click its two ends from above, and from the side
+too where they are at different heights, and run the same command with
+<code id="length">--length M x0 y0 z0 x1 y1 z1</code>, M in metres.</p>
 <h2>Masks</h2><img src="contact.jpg" style="max-width:100%"><h2>Left out</h2><ul>{left_out or "<li>nothing</li>"}</ul>
 <h2>Figures</h2><pre>{html.escape(json.dumps(brief, indent=1))}</pre>
 <script>{CLICKS}</script>"""

@@ -32,7 +32,8 @@ MIN_ARC = 60.0  # degrees around the object
 @dataclass(frozen=True)
 class Options:
     """masks: folder of masks.  ignore: nerfstudio's meaning of them.  poses: COLMAP model or transforms.json.  static:
-    number of the hypothesis to take.  height: metres of the object.  box: x0 y0 z0 x1 y1 z1 that the object is within,
+    number of the hypothesis to take.  height: metres of the object.  length: metres, and x0 y0 z0 x1
+    y1 z1 of two places so far apart, as capture.html has them.  box: x0 y0 z0 x1 y1 z1 that the object is within,
     as capture.html has it.  mask_model: draws masks' edges (``segmenters``).  max_views: photographs a state.  size:
     long edge in pixels."""
 
@@ -41,6 +42,7 @@ class Options:
     poses: Optional[Path] = None
     static: Optional[int] = None
     height: Optional[float] = None
+    length: Optional[tuple[float, ...]] = None
     box: Optional[tuple[float, ...]] = None
     mask_model: Optional[str] = None
     max_views: int = 60
@@ -93,7 +95,10 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
             cache, out / "masks", shots, [about_it, told(shots)],
             lambda: auto_masks(model, work / "photos", found, progress, within, segmenter), progress,
         )  # fmt: skip
-    model = world.scaled(model, masks, options.height, about)
+    if about["scale"]["source"] == "board" and (options.height or options.length):
+        progress("warning: the marker board says how long a metre is; what was given is left aside")
+    metres = world.given_length(options.length, about, out)
+    model = world.scaled(model, masks, options.height, about, metres)
     source = "given" if options.masks else "alpha" if shots[0].alpha else options.mask_model or "auto"
     facts = about | facts | {"masks": source}
     progress("writing")

@@ -54,23 +54,59 @@ def given_box(box: Optional[tuple[float, ...]], about: dict, out: Path) -> Optio
     without room in it, and where no earlier run says how long a unit is."""
     if box is None:
         return None
-    corners, factor, before = np.array(box, float).reshape(2, 3), 1.0, out / "capture.json"
+    corners = np.array(box, float).reshape(2, 3)
     if not (corners[0] < corners[1]).all():
         given = " ".join(f"{x:g}" for x in box)
         raise UserError(f"--box {given}: expected x0 y0 z0 x1 y1 z1, each first below its second")
-    if about["scale"]["source"] != "board":
-        if not before.is_file():
-            raise UserError(
-                f"--box: without a marker board its units are those of {out / 'capture.html'}, which is not there yet; "
-                "run without --box first"
-            )
-        factor = float(json.loads(before.read_text())["scale"].get("factor", 1.0))
-    return corners / factor
+    return corners / _unit_of("--box", box, about, out)
 
 
-def scaled(model: Model, masks: dict[str, np.ndarray], height: Optional[float], about: dict) -> Model:
-    """The model with the object's height [m], or else its diagonal of 1, where no board gave metres, and with the
-    object's lowest point at 0 where the floor is not known; notes it in ``about`` (of ``oriented``)."""
+def given_length(length: Optional[tuple[float, ...]], about: dict, out: Path) -> Optional[float]:
+    """Metres per unit of the model before it is scaled, by the option ``--length``: metres, and two places of
+    capture.html that are so far apart. Raises UserError for one place given twice, and where no earlier run says how
+    long a unit is."""
+    if length is None:
+        return None
+    ends = np.array(length[1:], float).reshape(2, 3)
+    apart = float(np.linalg.norm(ends[1] - ends[0]))
+    if not 0 < apart < np.inf:
+        raise UserError("--length: both ends are one place; expected M x0 y0 z0 x1 y1 z1, two places M metres apart")
+    return length[0] * _unit_of("--length", length, about, out) / apart
+
+
+def _unit_of(option: str, given: tuple[float, ...], about: dict, out: Path) -> float:
+    """Units of the capture.html that the numbers of an option were read off, over those of the model: kept with the
+    numbers, for with them the scene and that page get another unit, and the same command means the same again."""
+    if about["scale"]["source"] == "board":
+        return 1.0
+    path, before = out / ".capture" / "units.json", out / "capture.json"
+    try:
+        kept = dict(json.loads(path.read_text()))
+    except (FileNotFoundError, ValueError, TypeError):  # none was given before, or it was cut off
+        kept = {}
+    if option in kept and kept[option]["given"] == list(given):
+        return float(kept[option]["unit"])
+    if not before.is_file():
+        raise UserError(
+            f"{option}: without a marker board its units are those of {out / 'capture.html'}, which is not there yet; "
+            f"run without {option} first"
+        )
+    unit = float(json.loads(before.read_text())["scale"].get("factor", 1.0))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(kept | {option: {"given": list(given), "unit": unit}}))
+    return unit
+
+
+def scaled(
+    model: Model,
+    masks: dict[str, np.ndarray],
+    height: Optional[float],
+    about: dict,
+    metres: Optional[float] = None,
+) -> Model:
+    """The model with the object's height [m], or by ``metres`` per unit, or else its diagonal of 1, where no board gave
+    metres, and with the object's lowest point at 0 where the floor is not known; notes it in ``about`` (of
+    ``oriented``)."""
     scale, known = about["scale"], about["floor"] != UNKNOWN
     if scale["source"] != "board":
         box = box_of(model, masks, known)
@@ -78,6 +114,8 @@ def scaled(model: Model, masks: dict[str, np.ndarray], height: Optional[float], 
         factor = 1 / float(np.linalg.norm(box[1] - box[0]))
         if height is not None:
             factor, scale["source"] = height / (float(box[1, 2]) - bottom), "height"
+        if metres is not None:
+            factor, scale["source"] = metres, "length"
         T = np.diag([factor, factor, factor, 1.0])
         T[2, 3] = -factor * bottom
         model, scale["factor"] = model.moved(T), factor
