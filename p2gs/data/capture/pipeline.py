@@ -21,7 +21,7 @@ from p2gs.data.capture.joint import is_end
 from p2gs.data.capture.kept_masks import check_unedited, kept_masks
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred
-from p2gs.data.capture.segmenters import segmenter_of
+from p2gs.data.capture.segmenters import Segmenter, segmenter_of
 from p2gs.data.capture.solve import STATES, solved, told
 from p2gs.data.capture.static import check_joint_support, loose_poses
 from p2gs.types import UserError
@@ -32,9 +32,9 @@ MIN_ARC = 60.0  # degrees around the object
 @dataclass(frozen=True)
 class Options:
     """masks: folder of masks.  ignore: nerfstudio's meaning of them.  poses: COLMAP model or transforms.json.  static:
-    number of the hypothesis to take.  height: metres of the object.  length: metres, and x0 y0 z0 x1
-    y1 z1 of two places so far apart, as capture.html has them.  box: x0 y0 z0 x1 y1 z1 that the object is within,
-    as capture.html has it.  mask_model: draws masks' edges (``segmenters``).  max_views: photographs a state.  size:
+    number of the hypothesis to take.  height: metres of the object.  length: metres, and x0 y0 z0 x1 y1 z1
+    of two places so far apart, as capture.html has them.  box: x0 y0 z0 x1 y1 z1 that the object is within, as
+    capture.html has it.  mask_model: draws masks' edges (``segmenters``).  max_views: photographs a state.  size:
     long edge in pixels."""
 
     masks: Optional[Path] = None
@@ -62,7 +62,7 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
         raise UserError(f"{out}: is there already and was not made by p2gs data capture; expected a new folder")
     if start.exists() and end.exists() and start.samefile(end):
         raise UserError(f"{start}: is given for both states; expected the object in another joint state in each")
-    segmenter = None if options.mask_model is None else segmenter_of(options.mask_model)
+    segmenter = None if options.mask_model is None else segmenter_of(options.mask_model)  # before minutes of work
     cache = Cache(out / ".capture")
     if options.masks is None:
         check_unedited(cache, out / "masks")
@@ -84,17 +84,7 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     found = gains.photo_gains(model, work / "photos")
     model, about = world.oriented(model, corners)
     if masks is None:
-        world.check_floor(about, options.poses)
-        within = world.given_box(options.box, about, out)
-        about_it = [
-            _content(model, found),
-            None if within is None else within.tolist(),
-            _about_model(options.mask_model),
-        ]
-        masks = kept_masks(
-            cache, out / "masks", shots, [about_it, told(shots)],
-            lambda: auto_masks(model, work / "photos", found, progress, within, segmenter), progress,
-        )  # fmt: skip
+        masks = _made_masks(model, about, shots, found, segmenter, options, out, cache, progress)
     if about["scale"]["source"] == "board" and (options.height or options.length):
         progress("warning: the marker board says how long a metre is; what was given is left aside")
     metres = world.given_length(options.length, about, out)
@@ -104,12 +94,9 @@ def capture_scene(start: Path, end: Path, out: Path, options: Options, progress:
     progress("writing")
     files = write.write_scene(model, work / "photos", masks, found, out)
     box = world.box_of(model, masks)
-    for name, share in world.odd_masks(model, masks, box).items() if source in ("given", "alpha") else ():
-        file = next(s.source for s in shots if s.name == name)
-        progress(f"warning: {file}: {100 * share:.0f} % of its mask is what the other masks show; look at contact.jpg")
-    placed = {p.name for p in model.photos.values()}
-    unused = {True: "its mask is empty", False: "could not be placed among the others"}
-    left_out |= {s.name: (s.source, unused[s.name in placed]) for s in shots if s.name not in masks}
+    if source in ("given", "alpha"):
+        _warn_of_odd(world.odd_masks(model, masks, box), shots, progress)
+    left_out |= _unused(shots, masks, model)
     shots = [s for s in shots if s.name in masks]
     facts |= facts_of(model, shots, left_out, files, found, box)
     (out / "capture.json").write_text(json.dumps(facts, indent=1))
@@ -136,7 +123,8 @@ def _photos(sources: dict[str, Path], work: Path, cache: Cache, options: Options
         depends = ["edges measured", _stamp(source), options.size, options.max_views]
 
         def whole(result: dict) -> bool:
-            return all((work / "photos" / s["name"]).is_file() for s in result["shots"])
+            files = [file for s in result["shots"] for file in (s["name"], s["alpha"]) if file]
+            return all((work / "photos" / file).is_file() for file in files)
 
         result = cache.get(f"photos_{state}", depends, make, progress, whole)
         mine = [Shot(**s) for s in result["shots"]]
@@ -151,6 +139,44 @@ def _masks(shots: list[Shot], folder: Path, options: Options) -> Optional[dict[s
     if options.masks is not None:
         return given_masks.folder_masks(shots, options.masks, options.ignore)
     return given_masks.alpha_masks(shots, folder)
+
+
+def _made_masks(
+    model: Model,
+    about: dict,
+    shots: list[Shot],
+    found: dict[int, np.ndarray],
+    segmenter: Optional[Segmenter],
+    options: Options,
+    out: Path,
+    cache: Cache,
+    progress: Progress,
+) -> dict[str, np.ndarray]:
+    """Masks from 3D, those of the last run where nothing that they depend on has changed."""
+    if options.poses is not None:
+        world.check_floor(about, options.poses)
+    within = world.given_box(options.box, about, out)
+    corners = None if within is None else within.tolist()
+    depends = [_content(model, found), corners, _about_model(options.mask_model), told(shots)]
+
+    def make() -> dict[str, np.ndarray]:
+        return auto_masks(model, cache.folder / "photos", found, progress, within, segmenter)
+
+    return kept_masks(cache, out / "masks", shots, depends, make, progress)
+
+
+def _unused(shots: list[Shot], masks: dict[str, np.ndarray], model: Model) -> dict[str, tuple[str, str]]:
+    """{name: (source, reason)} of the photographs that have no mask."""
+    placed = {p.name for p in model.photos.values()}
+    reasons = {True: "its mask is empty", False: "could not be placed among the others"}
+    return {s.name: (s.source, reasons[s.name in placed]) for s in shots if s.name not in masks}
+
+
+def _warn_of_odd(odd: dict[str, float], shots: list[Shot], progress: Progress) -> None:
+    """A line for each photograph whose given mask shows another thing than the others' do."""
+    for shot in (s for s in shots if s.name in odd):
+        share = 100 * odd[shot.name]
+        progress(f"warning: {shot.source}: {share:.0f} % of its mask is what the other masks show; look at contact.jpg")
 
 
 def _about_model(given: Optional[str]) -> list:
