@@ -15,15 +15,14 @@ import numpy as np
 import torch
 
 from p2gs.data.capture.model import similarity
-from p2gs.data.frames import pose_matrix
+from p2gs.data.capture.poses import c2w_of
+from p2gs.data.frames import STATES
 from p2gs.data.ground_truth import parse_joint
 from p2gs.gaussians.twin_json import load_twin
 from p2gs.metrics.modules import JointError
 from p2gs.models.registered import REGISTRATION, read_registration
 from p2gs.scores.evaluate import scene_folder
 from p2gs.types import Joint, UserError, short
-
-STATES = ("start", "end")
 
 
 def _json(path: Path, key: str, kind: type | tuple[type, ...]):
@@ -69,24 +68,13 @@ def _pairs_of(
             )
         key = f"{state}/{Path(source[file]).stem}"
         if key in true:
-            own.append(_pose(frame.get("transform_matrix"), f"{path}: frame {i}"))
-            other.append(_pose(true[key], f"{truth / 'cameras.json'}: {key}"))
+            own.append(c2w_of(frame.get("transform_matrix"), f"{path}: frame {i}"))
+            other.append(c2w_of(true[key], f"{truth / 'cameras.json'}: {key}"))
     if len(own) < 3:
         raise UserError(
             f"{truth / 'cameras.json'}: knows {len(own)} photographs of state '{state}', expected at least 3"
         )
     return np.array(own), np.array(other)
-
-
-def _pose(value, where: str) -> np.ndarray:
-    """[4, 4] float64. Raises UserError for what is no pose."""
-    try:
-        pose = pose_matrix(value)
-    except ValueError as err:
-        raise UserError(f"{where}: camera pose is not a 4x4 matrix of numbers") from err
-    if not np.isfinite(pose).all():
-        raise UserError(f"{where}: camera pose holds values that are not finite")
-    return pose
 
 
 def rigid_between(own: np.ndarray, other: np.ndarray, with_scale: bool) -> np.ndarray:

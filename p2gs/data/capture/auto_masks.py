@@ -15,8 +15,9 @@ from p2gs.data.capture.hull import Hull, hull_of
 from p2gs.data.capture.joint import is_end, states_of
 from p2gs.data.capture.model import Lens, Model
 from p2gs.data.capture.segmenters import AROUND, Segmenter, frame_of
-from p2gs.data.capture.write import STATES, pinhole_of
+from p2gs.data.capture.write import pinhole_of
 from p2gs.data.exposure import corrected
+from p2gs.data.frames import STATES
 from p2gs.types import Camera, UserError
 
 COARSE = 200  # px, long edge of the splat's pictures

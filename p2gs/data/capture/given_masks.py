@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from p2gs.data.capture.photos import MIN_PHOTOS, Shot
+from p2gs.data.frames import STATES
 from p2gs.types import UserError
 
 SUFFIXES = (".png", ".PNG", ".jpg", ".jpg.png", ".jpeg.png", ".JPG.png", ".webp")
-STATES = ("start", "end")
 
 
 def mask_file(folder: Path, shot: Shot) -> Path:

@@ -22,8 +22,9 @@ from p2gs.data.capture.kept_masks import check_unedited, kept_masks
 from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, copy_photos, drop_blurred
 from p2gs.data.capture.segmenters import Segmenter, segmenter_of
-from p2gs.data.capture.solve import STATES, solved, told
+from p2gs.data.capture.solve import solved, told
 from p2gs.data.capture.static import check_joint_support, loose_poses
+from p2gs.data.frames import STATES
 from p2gs.types import UserError
 
 MIN_ARC = 60.0  # degrees around the object

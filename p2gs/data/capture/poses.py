@@ -86,7 +86,7 @@ def _unapplied(meta: dict, where: str) -> np.ndarray:
     return np.linalg.inv(T)
 
 
-def _c2w(given, where: str) -> np.ndarray:
+def c2w_of(given, where: str) -> np.ndarray:
     """[4, 4] of a frame's transform_matrix. Raises UserError for what is no pose."""
     try:
         c2w = pose_matrix(given)
@@ -127,7 +127,7 @@ def read_transforms(files: list[tuple[Path, str]]) -> Model:
             key = known.setdefault((lens.model, lens.width, lens.height, lens.params.tobytes()), len(known) + 1)
             lenses[key] = lens
             report = Report()
-            viewmat = opengl_pose(_rigid(undo @ _c2w(frame["transform_matrix"], where)), where, report)
+            viewmat = opengl_pose(_rigid(undo @ c2w_of(frame["transform_matrix"], where)), where, report)
             if viewmat is None:
                 raise UserError(report.findings[0].message)
             photos[len(photos) + 1] = Photo(prefix + frame["file_path"], key, viewmat)

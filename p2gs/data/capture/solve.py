@@ -20,9 +20,8 @@ from p2gs.data.capture.model import Model
 from p2gs.data.capture.photos import Shot, lens_groups
 from p2gs.data.capture.poses import MIN_REGISTERED, MIN_SHARE, some_of
 from p2gs.data.capture.static import LINKED, check_link, choose, hypotheses_of, link
+from p2gs.data.frames import STATES
 from p2gs.types import UserError
-
-STATES = ("start", "end")
 
 
 def told(shots: list[Shot]) -> list:

@@ -171,14 +171,13 @@ def odd_masks(model: Model, masks: dict[str, np.ndarray], box: np.ndarray) -> di
     from p2gs.data.capture.auto_masks import ALIKE, COARSE
     from p2gs.data.capture.hull import agreement
 
-    odd: dict[str, float] = {}
+    outlines, odd = {}, {}
+    for name, (camera, alpha) in undistorted(model, masks).items():
+        factor = min(1.0, COARSE / max(camera.width, camera.height))
+        size = (round(camera.width * factor), round(camera.height * factor))
+        outlines[name] = camera.scaled(*size), cv2.resize(alpha, size, interpolation=cv2.INTER_AREA) > 127
     for end in (False, True):
-        outlines = {}
-        for name, (camera, alpha) in undistorted(model, masks).items():
-            if is_end(name) == end:
-                factor = min(1.0, COARSE / max(camera.width, camera.height))
-                size = (round(camera.width * factor), round(camera.height * factor))
-                outlines[name] = camera.scaled(*size), cv2.resize(alpha, size, interpolation=cv2.INTER_AREA) > 127
-        shares = agreement(list(outlines.values()), box)
-        odd |= {name: share for name, share in zip(outlines, shares, strict=True) if share < ALIKE}
+        mine = {name: outline for name, outline in outlines.items() if is_end(name) == end}
+        shares = agreement(list(mine.values()), box)
+        odd |= {name: share for name, share in zip(mine, shares, strict=True) if share < ALIKE}
     return odd

@@ -14,10 +14,9 @@ from p2gs.data.box import mask_bounds
 from p2gs.data.capture.colmap_io import write_model
 from p2gs.data.capture.model import Lens, Model
 from p2gs.data.exposure import corrected
+from p2gs.data.frames import STATES
 from p2gs.data.views import MARGIN
 from p2gs.types import UserError
-
-STATES = ("start", "end")
 
 
 @dataclass(frozen=True)
