@@ -5,6 +5,10 @@ shape is; else it makes up for what is wrong with the shape, too (a plain door t
 Here both states' photographs answer for shape and motion at once. They tell little of so small differences, and
 Gaussians bend to whatever motion they are under: a motion is taken only if the image loss is lower than with the same
 Gaussians fitted as long under the motions as they were.
+
+A part's Gaussians are kept where more pixels show them, at the start or at the end, and the motion or its inverse
+brings them to the other state. It is the same twin in other coordinates; kept at the start, what the end alone shows
+would have to follow every step of the motion, and held it back.
 """
 
 from __future__ import annotations
@@ -22,15 +26,16 @@ from p2gs.gaussians.pose import carry, with_static
 from p2gs.gaussians.splats import Splats
 from p2gs.models.tune import TuneConfig, TwinSteps
 from p2gs.motion.light import TurnedLight, brighter, facing_either
-from p2gs.motion.part_pull import part_pulls
+from p2gs.motion.part_pull import by_inverse, part_pulls
 from p2gs.motion.screw_polish import MotionSteps, MovedGaussians, PolishConfig, Side, anchors_of, photometric_cost
 from p2gs.native import at_once, serial_torch
 from p2gs.ops import se3
-from p2gs.ops.carry import RigidMoves
+from p2gs.ops.carry import Parts, RigidMoves
 from p2gs.ops.ssim import l1_ssim
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
 from p2gs.visibility.depth_stack import DepthStack
+from p2gs.visibility.share import seen_pixels
 
 
 def fit_together(
@@ -60,10 +65,16 @@ def fit_together(
     if config.steps <= 0 or len(motions) == 0 or len(gaussians) == 0:
         return motions, {}
     at_start = carry(gaussians, labels, with_static(se3.screw_at(motions.transforms, -time)))
+    at_end = carry(at_start, labels, with_static(motions.transforms))
+    pixels = [
+        seen_pixels(g, [views[s].camera(i, 0) for i in range(len(views[s]))], backend)
+        for s, g in enumerate((at_start, at_end))
+    ]
+    homes = torch.where(pixels[1] > pixels[0], labels, 0)
     normals = torch.zeros_like(at_start.means)
     if stacks is not None:
         normals = facing_either(at_start, labels, motions.transforms, stacks, tau)
-    options = {"axes": axes, "normals": normals, "seed": seed, "backend": backend, "device": device}
+    options = {"homes": homes, "axes": axes, "normals": normals, "seed": seed, "backend": backend, "device": device}
     fit = partial(_fit, at_start, labels, motions, views, config, ssim_lambda, **options)
     (_, held), (fitted, free) = at_once(fit, (0.0, config.rates.means))
     return (fitted if free < held else motions), {"held": held, "free": free}
@@ -78,6 +89,7 @@ def _fit(
     ssim_lambda: float,
     rate: float,
     *,
+    homes: Tensor,
     axes: Tensor | None,
     normals: Tensor,
     seed: int,
@@ -85,45 +97,48 @@ def _fit(
     device: torch.device | str,
 ) -> tuple[PartMotions, float]:
     """Motions and the loss of both states' photographs after ``config.steps`` steps; g: at the start.
-    rate: of the motions (0: they are held).  normals [N, 3]: which way Gaussians face at the start (0: not known)."""
-    splats, T, some = Splats(g).to(device), motions.transforms.double().clone(), torch.ones(len(motions)).bool()
-    body = MovedGaussians(g, labels, device)
-    labels, parts = body.labels, body.bodies
-    middle, spread = anchors_of([Side(g, labels, views[1])], [body], T)
+    rate: of the motions (0: they are held).  homes [N]: the part of a Gaussian that is kept at the end, 0 of others.
+    normals [N, 3]: which way Gaussians face at the start (0: not known)."""
+    T, some = motions.transforms.double().clone(), torch.ones(len(motions)).bool()
+    # whom a motion brings to the start, and whom to the end
+    moved = [of.to(device) for of in (homes, torch.where(homes > 0, 0, labels))]
+    parts = [Parts(of) for of in moved]
+    middle, spread = anchors_of([Side(g, labels, views[1])], [MovedGaussians(g, labels, device)], T)
+    splats = Splats(carry(g, homes, with_static(T))).to(device)
     by_motion = MotionSteps(motions.types, spread, rate, axes)
     turns = torch.tensor([float(kind != "prismatic") for kind in motions.types])[:, None].to(device)
     light, normals = torch.zeros(len(motions), 4, device=device, requires_grad=True), normals.to(device)
     steps = TwinSteps(splats, views, config, seed, light)
 
-    def gains() -> Tensor:
-        return TurnedLight(light * turns).gains(labels, normals)
+    def gains(state: int) -> Tensor:
+        gain = TurnedLight(light * turns).gains(moved[state], normals)
+        return gain if state else 1 / gain
 
     def one_step(step: int) -> None:
         nonlocal T
         state, shot, background = steps.shot(step)
-        posed = splats.tensors()
-        if state:
-            means, quats = RigidMoves(parts, T.to(device))(posed.means, posed.quats)
-            means.retain_grad()
-            quats.retain_grad()
-            posed = GaussianTensors(means, quats, posed.log_scales, posed.opacity_logits, posed.sh)
-            posed = brighter(posed, gains())
+        own, way = splats.tensors(), T if state else se3.inverse(T)
+        means, quats = RigidMoves(parts[state], way.to(device))(own.means, own.quats)
+        means.retain_grad()
+        quats.retain_grad()
+        posed = GaussianTensors(means, quats, own.log_scales, own.opacity_logits, own.sh)
         image, camera = shot.image.to(device), shot.camera.to(device)
-        out = render_gaussians(posed, camera, background.to(device), backend=backend)
+        out = render_gaussians(brighter(posed, gains(state)), camera, background.to(device), backend=backend)
         steps.take(l1_ssim(out.colour, image, ssim_lambda))
-        if state and rate > 0:
+        if rate > 0:
             centre = se3.apply(T, middle[:, None])[:, 0]
-            T = by_motion.take(T, part_pulls(means, quats, parts, centre), centre, step / config.steps, some)
+            pulls = part_pulls(means, quats, parts[state], centre if state else middle)
+            pulls = pulls if state else by_inverse(pulls, T)
+            T = by_motion.take(T, pulls, centre, step / config.steps, some)
 
     with serial_torch(draws_natively(splats.means, backend)):
         for step in range(config.steps):
             one_step(step)
     T = by_motion.ended(T)
-    ended, gain, labels = splats.tensors().detach().to("cpu"), gains().detach().cpu(), labels.cpu()
-    there = brighter(carry(ended, labels, with_static(T)), gain)
+    ended, losses = splats.tensors().detach().to("cpu"), []
     options = {"level": config.levels[-1], "ssim_lambda": ssim_lambda, "backend": backend, "device": device}
-    still = torch.zeros_like(labels), torch.zeros(0, 4, 4).double()  # as they are
-    losses = [
-        photometric_cost(at, *still, views[s], count=len(views[s]), **options) for s, at in enumerate((ended, there))
-    ]
+    still = torch.zeros_like(homes), torch.zeros(0, 4, 4).double()  # as they are
+    for s, way in enumerate((se3.inverse(T), T)):
+        posed = brighter(carry(ended, moved[s].cpu(), with_static(way)), gains(s).detach().cpu())
+        losses.append(photometric_cost(posed, *still, views[s], count=len(views[s]), **options))
     return replace(motions, transforms=T), sum(losses)

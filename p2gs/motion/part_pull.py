@@ -51,6 +51,14 @@ def part_pulls_reference(
     return pulls.new_zeros(len(centres), 6).index_add_(0, part, pulls).cpu()
 
 
+def by_inverse(pulls: Tensor, transforms: Tensor) -> Tensor:
+    """Gradient [K, 6] by small motions about T c that follow the motions T [K, 4, 4], of what their inverses carry:
+    from ``pulls`` [K, 6], that of what T^-1 brought there about c. T^-1 turns such a motion by R^T and undoes it.
+    """
+    R = transforms[:, :3, :3]
+    return -torch.cat([(R @ part[..., None])[..., 0] for part in pulls.split(3, 1)], 1)
+
+
 def tangent_gradient(
     means: Tensor, quats: Tensor, grad_means: Tensor, grad_quats: Tensor, centre: Tensor
 ) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
 from p2gs.motion.light import FEWEST
-from p2gs.motion.part_pull import part_pulls
+from p2gs.motion.part_pull import by_inverse, part_pulls
 from p2gs.ops import se3, so3
 from p2gs.ops.carry import Parts, carry
 from p2gs.ops.decay import exponential
@@ -256,7 +256,7 @@ def polish(
         )
         gradient = part_pulls(means, quats, body.bodies, anchors if side.back else centre, limit)
         if side.back:
-            gradient = -torch.cat([(transforms[:, :3, :3] @ g[..., None])[..., 0] for g in gradient.split(3, 1)], 1)
+            gradient = by_inverse(gradient, transforms)
         transforms = steps.take(transforms, gradient, centre, fraction, enough[turn])
     transforms = steps.ended(transforms)
     last = [of[-max(config.steps // 10, 1) :] for of in losses]
