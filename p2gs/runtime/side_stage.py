@@ -27,8 +27,8 @@ PATIENCE = 60.0  # seconds to save the state in
 
 
 def can_run_beside(cfg: RunConfig, device: torch.device, phase: str = "single_state") -> bool:
-    """Whether both states' runs of a phase can be trained at once: on a CPU, with two threads or more, nothing that
-    wants a run for itself.
+    """Whether both states' runs of a phase can be trained at once: with two threads or more, on a device that two
+    processes may use, nothing that wants a run for itself.
 
     A loss or callback that the running program registered itself (no plugin) is unknown to another process: then one
     after the other.
@@ -38,7 +38,21 @@ def can_run_beside(cfg: RunConfig, device: torch.device, phase: str = "single_st
     known = {"p2gs", *(name.removesuffix(".py").replace("/", ".") for name in cfg.plugins)}
     makers = [PHASES[phase], *(type(x) for x in (cfg.data, section.config, *section.losses.values(), *callbacks))]
     foreign = any(not any(f"{make.__module__}.".startswith(f"{name}.") for name in known) for make in makers)
-    return device.type == "cpu" and torch.get_num_threads() > 1 and not foreign and not any(c.alone for c in callbacks)
+    if torch.get_num_threads() < 2 or foreign or any(c.alone for c in callbacks):
+        return False
+    return device.type == "cpu" or takes_processes(device)
+
+
+def takes_processes(device: torch.device) -> bool:
+    """Whether a CUDA device is in its default mode, in which several processes may use it; clusters set others. False
+    where the driver's nvidia-smi cannot say."""
+    which = f"GPU-{torch.cuda.get_device_properties(device).uuid}"
+    ask = ["nvidia-smi", "-i", which, "--query-gpu=compute_mode", "--format=csv,noheader"]
+    try:
+        told = subprocess.run(ask, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout
+    except (OSError, subprocess.SubprocessError):
+        return False
+    return told.strip() == "Default"
 
 
 class SideStage:

@@ -7,6 +7,7 @@ import subprocess
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -93,7 +94,7 @@ def test_what_only_this_program_knows_is_not_run_beside(tmp_path):
     try:
         torch.set_num_threads(2)
         plain = load_config([str(config(tmp_path))])
-        assert can_run_beside(plain, torch.device("cpu")) and not can_run_beside(plain, torch.device("cuda"))
+        assert can_run_beside(plain, torch.device("cpu"))
         own = load_config([str(config(tmp_path))], ["--callbacks.side_stage_test_only", "{}"])
         assert not can_run_beside(own, torch.device("cpu"))
         watched = load_config([str(config(tmp_path))], ["--callbacks.viewer", "{}"])
@@ -102,3 +103,17 @@ def test_what_only_this_program_knows_is_not_run_beside(tmp_path):
         assert not can_run_beside(plain, torch.device("cpu"))
     finally:
         torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("mode, beside", [("Default", True), ("Exclusive_Process", False), (None, False)])
+def test_a_gpu_of_one_process_trains_one_state_after_the_other(mode, beside, tmp_path, monkeypatch):
+    def nvidia_smi(words, **options):
+        assert words[:3] == ["nvidia-smi", "-i", "GPU-4f6e"]
+        if mode is None:
+            raise FileNotFoundError(words[0])
+        return subprocess.CompletedProcess(words, 0, mode + "\n")
+
+    monkeypatch.setattr("p2gs.runtime.side_stage.subprocess.run", nvidia_smi)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid="4f6e"))
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    assert can_run_beside(load_config([str(config(tmp_path))]), torch.device("cuda")) == beside
