@@ -11,6 +11,7 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.losses.base import Loss
+from p2gs.models.homes import Homes, homes_of
 from p2gs.models.joint_of import constrain, make_joint, name_types
 from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig, tune
@@ -129,14 +130,14 @@ def finish(
     labels, alive, notes = _slots(learned, config)
     keep = torch.tensor([k - 1 for k in alive], dtype=torch.int64)
     types, transforms = _typed(learned, labels, keep, config.prismatic_below)
-    time = learned.canonical_time
+    gaussians, time = learned.gaussians, learned.canonical_time
     axes = torch.full((len(types), 3), torch.nan).double()
     if discovered is not None and len(discovered) == len(learned.types):
         axes = shared_axes(discovered.transforms, discovered.types)[keep]
     options: dict[str, Any] = {"backend": backend, "device": device}
     level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
-    twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
+    twin = assemble(gaussians, labels, types, transforms, time, similarity)
     limits = {"islands": config.islands, "trays": config.trays, "tau": config.polish.free_static or 0.02}
     labels, moved = settle_labels(twin, views, stacks, **limits, backend=twin_backend or backend)
     found = [state_labels(learned, labels, s, transforms) for s in states]
@@ -150,10 +151,13 @@ def finish(
         refined, record.laid = _refined(judge, motions, axes, config)
         refined, labels, left = _founded(record, judge, refined, labels, axes, config, level)
         notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
-        refined = _with_gaussians(record, judge, refined, learned, labels, config, level)
+        homes = homes_of(gaussians, labels, record.before, time, views, backend)
+        kept = homes.kept(gaussians, record.before, time)
+        refined = _with_gaussians(record, judge, refined, kept, homes, config, level)
         types, transforms = refined.types, refined.transforms
+        gaussians = homes.posed(kept, transforms, time)
     options["backend"] = twin_backend or backend
-    gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
+    gaussians = tune(gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
     twin = assemble(gaussians, labels, types, transforms, time, similarity, [e.confidence for e in record.evidence])
     if config.extend_range:
         twin.parts = extend_ranges(twin)
@@ -230,20 +234,20 @@ def _with_gaussians(
     record: FinishRecord,
     judge: Judge,
     motions: PartMotions,
-    learned: Articulation,
-    labels: Tensor,
+    kept: GaussianTensors,
+    homes: Homes,
     config: FinishConfig,
     level: int,
 ) -> PartMotions:
     """The motions as photographs have them when Gaussians bend with them (``fit_together``); slides of a row keep their
-    direction. labels [N]: the twin's."""
+    direction. kept: the twin's Gaussians, each in its own state."""
     if config.polish.steps <= 0:
         return motions
     options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
     options |= {"axes": shared_axes(motions.transforms, motions.types), "tau": config.polish.free_static}
     options["stacks"] = judge.stacks if config.polish.free_static > 0 else None
-    g, time, lambda_ = learned.gaussians, learned.canonical_time, config.polish.ssim_lambda
-    fitted, record.together = fit_together(g, labels, motions, time, judge.views, config.together, lambda_, **options)
+    lambda_ = config.polish.ssim_lambda
+    fitted, record.together = fit_together(kept, homes, motions, judge.views, config.together, lambda_, **options)
     if fitted is not motions:
         record.after = fitted.transforms
         measure(record, judge, fitted, level)

@@ -6,9 +6,9 @@ Here both states' photographs answer for shape and motion at once. They tell lit
 Gaussians bend to whatever motion they are under: a motion is taken only if the image loss is lower than with the same
 Gaussians fitted as long under the motions as they were.
 
-A part's Gaussians are kept where more pixels show them, at the start or at the end, and the motion or its inverse
-brings them to the other state. It is the same twin in other coordinates; kept at the start, what the end alone shows
-would have to follow every step of the motion, and held it back.
+A part's Gaussians are fitted where they are kept (``homes``), and the motion or its inverse brings them to the other
+state: all of them at the start would be the same twin, but what the end alone shows would have to follow every step of
+the motion, and held it back.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import PartMotions
 from p2gs.gaussians.pose import carry, with_static
 from p2gs.gaussians.splats import Splats
+from p2gs.models.homes import Homes
 from p2gs.models.tune import TuneConfig, TwinSteps
 from p2gs.motion.light import TurnedLight, brighter, facing_either
 from p2gs.motion.part_pull import by_inverse, part_pulls
@@ -35,14 +36,12 @@ from p2gs.ops.ssim import l1_ssim
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
 from p2gs.visibility.depth_stack import DepthStack
-from p2gs.visibility.share import seen_pixels
 
 
 def fit_together(
-    gaussians: GaussianTensors,
-    labels: Tensor,
+    kept: GaussianTensors,
+    homes: Homes,
     motions: PartMotions,
-    time: float,
     views: dict[int, TrainingViews],
     config: TuneConfig,
     ssim_lambda: float,
@@ -57,54 +56,46 @@ def fit_together(
     """The motions as they were or as both states' photographs have them, and the image loss (sum of both states') with
     either: {"held", "free"} ({} where nothing was fitted).
 
-    gaussians: at canonical ``time``, labels [N] (0 static).  views: photographs by state.  config: steps of the
-    Gaussians (0 = off); a part's motion learns at the rate of their centres.  ssim_lambda: weight of SSIM against L1.
+    kept: Gaussians, each in its own state.  views: photographs by state.  config: steps of the Gaussians (0 = off); a
+    part's motion learns at the rate of their centres.  ssim_lambda: weight of SSIM against L1.
     axes [K, 3]: directions that joints keep (NaN: free; None: all are).  stacks: rendered depth of both states, by
     which Gaussians face those who see them on a surface, to within ``tau`` (None: a part's sides are lit alike).
     """
-    if config.steps <= 0 or len(motions) == 0 or len(gaussians) == 0:
+    if config.steps <= 0 or len(motions) == 0 or len(kept) == 0:
         return motions, {}
-    at_start = carry(gaussians, labels, with_static(se3.screw_at(motions.transforms, -time)))
-    at_end = carry(at_start, labels, with_static(motions.transforms))
-    pixels = [
-        seen_pixels(g, [views[s].camera(i, 0) for i in range(len(views[s]))], backend)
-        for s, g in enumerate((at_start, at_end))
-    ]
-    homes = torch.where(pixels[1] > pixels[0], labels, 0)
-    normals = torch.zeros_like(at_start.means)
+    normals = torch.zeros_like(kept.means)
     if stacks is not None:
-        normals = facing_either(at_start, labels, motions.transforms, stacks, tau)
-    options = {"homes": homes, "axes": axes, "normals": normals, "seed": seed, "backend": backend, "device": device}
-    fit = partial(_fit, at_start, labels, motions, views, config, ssim_lambda, **options)
+        at_start = homes.posed(kept, motions.transforms, 0.0)
+        normals = facing_either(at_start, homes.labels, motions.transforms, stacks, tau)
+    options = {"axes": axes, "normals": normals, "seed": seed, "backend": backend, "device": device}
+    fit = partial(_fit, kept, homes, motions, views, config, ssim_lambda, **options)
     (_, held), (fitted, free) = at_once(fit, (0.0, config.rates.means))
     return (fitted if free < held else motions), {"held": held, "free": free}
 
 
 def _fit(
-    g: GaussianTensors,
-    labels: Tensor,
+    kept: GaussianTensors,
+    homes: Homes,
     motions: PartMotions,
     views: dict[int, TrainingViews],
     config: TuneConfig,
     ssim_lambda: float,
     rate: float,
     *,
-    homes: Tensor,
     axes: Tensor | None,
     normals: Tensor,
     seed: int,
     backend: str,
     device: torch.device | str,
 ) -> tuple[PartMotions, float]:
-    """Motions and the loss of both states' photographs after ``config.steps`` steps; g: at the start.
-    rate: of the motions (0: they are held).  homes [N]: the part of a Gaussian that is kept at the end, 0 of others.
-    normals [N, 3]: which way Gaussians face at the start (0: not known)."""
+    """Motions and the loss of both states' photographs after ``config.steps`` steps.
+    rate: of the motions (0: they are held).  normals [N, 3]: which way Gaussians face at the start (0: not known)."""
     T, some = motions.transforms.double().clone(), torch.ones(len(motions)).bool()
-    # whom a motion brings to the start, and whom to the end
-    moved = [of.to(device) for of in (homes, torch.where(homes > 0, 0, labels))]
+    moved = [of.to(device) for of in (homes.at_end, homes.at_start)]  # who is carried to the start, and who to the end
     parts = [Parts(of) for of in moved]
-    middle, spread = anchors_of([Side(g, labels, views[1])], [MovedGaussians(g, labels, device)], T)
-    splats = Splats(carry(g, homes, with_static(T))).to(device)
+    at_start, labels = homes.posed(kept, T, 0.0), homes.labels
+    middle, spread = anchors_of([Side(at_start, labels, views[1])], [MovedGaussians(at_start, labels, device)], T)
+    splats = Splats(kept).to(device)
     by_motion = MotionSteps(motions.types, spread, rate, axes)
     turns = torch.tensor([float(kind != "prismatic") for kind in motions.types])[:, None].to(device)
     light, normals = torch.zeros(len(motions), 4, device=device, requires_grad=True), normals.to(device)
@@ -137,7 +128,7 @@ def _fit(
     T = by_motion.ended(T)
     ended, losses = splats.tensors().detach().to("cpu"), []
     options = {"level": config.levels[-1], "ssim_lambda": ssim_lambda, "backend": backend, "device": device}
-    still = torch.zeros_like(homes), torch.zeros(0, 4, 4).double()  # as they are
+    still = torch.zeros_like(labels), torch.zeros(0, 4, 4).double()  # as they are
     for s, way in enumerate((se3.inverse(T), T)):
         posed = brighter(carry(ended, moved[s].cpu(), with_static(way)), gains(s).detach().cpu())
         losses.append(photometric_cost(posed, *still, views[s], count=len(views[s]), **options))

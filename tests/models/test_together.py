@@ -7,6 +7,7 @@ from tiny import hinge, photographs, slide
 
 from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import PartMotions
+from p2gs.models.homes import Homes, homes_of
 from p2gs.models.single_state import SplatRates
 from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig
@@ -21,7 +22,9 @@ JOINTS = [("revolute", hinge()), ("prismatic", slide())]
 
 def fitted(g, labels, views, kind, start, config=LEVEL, **options):
     motions = PartMotions([kind], start[None], torch.ones(1), [labels, labels], [torch.ones(len(labels))] * 2)
-    return motions, *fit_together(g, labels, motions, 0.0, views, config, SSIM, seed=0, **options)
+    homes = homes_of(g, labels, motions.transforms, 0.0, views)
+    kept = homes.kept(g, motions.transforms, 0.0)
+    return motions, *fit_together(kept, homes, motions, views, config, SSIM, seed=0, **options)
 
 
 def off(found, truth, g, labels):
@@ -35,7 +38,7 @@ def test_a_motion_that_is_off_is_put_right_and_keeps_its_type(kind, truth, kept,
     states, labels, views = two_states(truth)
     if kept != "where it is seen":
         pixels = iter([1.0, 2.0] if kept == "all at the end" else [2.0, 1.0])
-        monkeypatch.setattr("p2gs.models.together.seen_pixels", lambda g, *_: torch.full((len(g),), next(pixels)))
+        monkeypatch.setattr("p2gs.models.homes.seen_pixels", lambda g, *_: torch.full((len(g),), next(pixels)))
     g, wrong = states[0].gaussians, se3.screw_at(truth[None], 1.02)[0]
     _, found, loss = fitted(g, labels, views, kind, wrong, SLOW)
     T = found.transforms[0]
@@ -83,5 +86,6 @@ def test_without_steps_or_parts_nothing_is_fitted():
     none = PartMotions(
         [], torch.zeros(0, 4, 4).double(), torch.ones(0), [0 * labels] * 2, [torch.ones(len(labels))] * 2
     )
-    assert fit_together(g, labels, motions, 0.0, views, TuneConfig(steps=0), SSIM, seed=0) == (motions, {})
-    assert fit_together(g, 0 * labels, none, 0.0, views, LEVEL, SSIM, seed=0) == (none, {})
+    off, still = TuneConfig(steps=0), 0 * labels
+    assert fit_together(g, Homes(labels, labels), motions, views, off, SSIM, seed=0) == (motions, {})
+    assert fit_together(g, Homes(still, still), none, views, LEVEL, SSIM, seed=0) == (none, {})
