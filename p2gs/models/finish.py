@@ -38,8 +38,8 @@ class FinishConfig:
     photographs prefer it. tune: the Gaussians once more, with the screws frozen. min_mass: a slot with a smaller share
     of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
     part_penalty: share of the image loss in its own pixels that a part with an axis of its own must save against being
-    static or one with a part that it touches, as in discovery (0: parts stay). min_confidence: a part of less vanishes,
-    as in discovery (0: none does).
+    static or one with a part that it touches, as in discovery (0: parts stay). min_confidence: a part whose joint is
+    less likely to be right vanishes (0: none does).
     askew: share of the image loss that an axis which is askew to the object's directions must save against one along
     them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a
     slide, and a turn by less is one unless it explains the photographs better by freedom_penalty (share of the image
@@ -66,7 +66,7 @@ class FinishConfig:
     min_mass: float = 0.002
     min_motion: float = 0.01
     part_penalty: float = PartMotionsConfig.part_penalty
-    min_confidence: float = PartMotionsConfig.min_confidence
+    min_confidence: float = 0.3  # of captures: false parts had 0.27 to 0.29, true ones 0.35 and more
     askew: float = 0.04  # sharp photographs prefer a plain front beside its place by up to 0.036
     prismatic_below: float = 5.0
     freedom_penalty: float = PartMotionsConfig.freedom_penalty
