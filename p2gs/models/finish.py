@@ -34,8 +34,8 @@ class FinishConfig:
     """Options of the last stage.
 
     polish: photometric refinement of the screws with hard labels and frozen Gaussians. survey: shifts of a part within
-    its own surface that are tried after it (internal units; [] = none). together: then screws and Gaussians at once, if
-    photographs prefer it. tune: the Gaussians once more, with the screws frozen. min_mass: a slot with a smaller share
+    its own surface that are tried after it (internal units; [] = none). together: then screws and Gaussians at
+    once. tune: the Gaussians once more, with the screws frozen. min_mass: a slot with a smaller share
     of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
     part_penalty: share of the image loss in its own pixels that a part with an axis of its own must save against being
     static or one with a part that it touches, as in discovery (0: parts stay). min_confidence: a part whose joint is
@@ -89,7 +89,7 @@ class FinishRecord:
     labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the
     polish (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
     start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.
-    together: image loss with screws held and free (``fit_together``; {}: not tried).
+    together: image loss before and after screws and Gaussians were fitted at once (``fit_together``; {}: not done).
     laid: axes that were tried along the object's directions (``lay_axes``).  slots: the learned slot of each part.
     contents: Gaussians that became a drawer's because they are on or in its tray.
     """
@@ -250,7 +250,7 @@ def _with_gaussians(
     options["stacks"] = judge.stacks if config.polish.free_static > 0 else None
     lambda_ = config.polish.ssim_lambda
     fitted, record.together = fit_together(kept, homes, motions, judge.views, config.together, lambda_, **options)
-    if fitted is not motions:
+    if record.together:
         record.after = fitted.transforms
         measure(record, judge, fitted, level)
     return fitted
