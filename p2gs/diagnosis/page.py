@@ -249,10 +249,10 @@ def _finish(d: dict) -> list[str]:
         rows = [[k.replace("_", " "), _number(w["before"]), _number(w["after"])] for k, w in ways]
         out.append(table(["image loss", "before the polish", "after"], rows))
     if p["together"]:
-        before, after = (_number(p["together"][k]) for k in ("before", "after"))
+        held, free = (_number(p["together"][k]) for k in ("held", "free"))
         out.append(
-            f'<p class="soft">Gaussians and joints fitted at once to the photographs of both states: image loss '
-            f"{before} before, {after} after</p>"
+            f'<p class="soft">Gaussians of both states fitted once more: image loss {held} with joints held, '
+            f"{free} with joints that learn, too; the lower one counts</p>"
         )
     if p["contents"]:
         out.append(

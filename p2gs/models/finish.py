@@ -11,7 +11,6 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.losses.base import Loss
-from p2gs.models.homes import Homes, homes_of
 from p2gs.models.joint_of import constrain, make_joint, name_types
 from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig, tune
@@ -34,8 +33,8 @@ class FinishConfig:
     """Options of the last stage.
 
     polish: photometric refinement of the screws with hard labels and frozen Gaussians. survey: shifts of a part within
-    its own surface that are tried after it (internal units; [] = none). together: then screws and Gaussians at
-    once. tune: the Gaussians once more, with the screws frozen. min_mass: a slot with a smaller share
+    its own surface that are tried after it (internal units; [] = none). together: then screws and Gaussians at once, if
+    photographs prefer it. tune: the Gaussians once more, with the screws frozen. min_mass: a slot with a smaller share
     of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
     part_penalty: share of the image loss in its own pixels that a part with an axis of its own must save against being
     static or one with a part that it touches, as in discovery (0: parts stay). min_confidence: a part whose joint is
@@ -58,9 +57,7 @@ class FinishConfig:
     """
 
     polish: PolishConfig = field(default_factory=lambda: PolishConfig(min_margin=0.0))
-    # while Gaussians still move, turns are too small: fridge2's second door by 0.17, 0.08 and 0.05 degrees after 900,
-    # 1,800 and 2,700 steps
-    together: TuneConfig = field(default_factory=lambda: TuneConfig(steps=1800))
+    together: TuneConfig = field(default_factory=TuneConfig)
     tune: TuneConfig = field(default_factory=TuneConfig)
     survey: list[float] = field(default_factory=lambda: [0.03, 0.06, 0.09])
     min_mass: float = 0.002
@@ -89,7 +86,7 @@ class FinishRecord:
     labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the
     polish (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
     start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.
-    together: image loss before and after screws and Gaussians were fitted at once (``fit_together``; {}: not done).
+    together: image loss with screws held and free (``fit_together``; {}: not tried).
     laid: axes that were tried along the object's directions (``lay_axes``).  slots: the learned slot of each part.
     contents: Gaussians that became a drawer's because they are on or in its tray.
     """
@@ -132,14 +129,14 @@ def finish(
     labels, alive, notes = _slots(learned, config)
     keep = torch.tensor([k - 1 for k in alive], dtype=torch.int64)
     types, transforms = _typed(learned, labels, keep, config.prismatic_below)
-    gaussians, time = learned.gaussians, learned.canonical_time
+    time = learned.canonical_time
     axes = torch.full((len(types), 3), torch.nan).double()
     if discovered is not None and len(discovered) == len(learned.types):
         axes = shared_axes(discovered.transforms, discovered.types)[keep]
     options: dict[str, Any] = {"backend": backend, "device": device}
     level = common_level(views)
     stacks = [state_depth(state, views[s], level, **options) for s, state in enumerate(states)]
-    twin = assemble(gaussians, labels, types, transforms, time, similarity)
+    twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
     limits = {"islands": config.islands, "trays": config.trays, "tau": config.polish.free_static or 0.02}
     labels, moved = settle_labels(twin, views, stacks, **limits, backend=twin_backend or backend)
     found = [state_labels(learned, labels, s, transforms) for s in states]
@@ -153,13 +150,10 @@ def finish(
         refined, record.laid = _refined(judge, motions, axes, config)
         refined, labels, left = _founded(record, judge, refined, labels, axes, config, level)
         notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
-        homes = homes_of(gaussians, labels, record.before, time, views, backend)
-        kept = homes.kept(gaussians, record.before, time)
-        refined = _with_gaussians(record, judge, refined, kept, homes, config, level)
+        refined = _with_gaussians(record, judge, refined, learned, labels, config, level)
         types, transforms = refined.types, refined.transforms
-        gaussians = homes.posed(kept, transforms, time)
     options["backend"] = twin_backend or backend
-    gaussians = tune(gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
+    gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
     twin = assemble(gaussians, labels, types, transforms, time, similarity, [e.confidence for e in record.evidence])
     if config.extend_range:
         twin.parts = extend_ranges(twin)
@@ -236,21 +230,21 @@ def _with_gaussians(
     record: FinishRecord,
     judge: Judge,
     motions: PartMotions,
-    kept: GaussianTensors,
-    homes: Homes,
+    learned: Articulation,
+    labels: Tensor,
     config: FinishConfig,
     level: int,
 ) -> PartMotions:
     """The motions as photographs have them when Gaussians bend with them (``fit_together``); slides of a row keep their
-    direction. kept: the twin's Gaussians, each in its own state."""
+    direction. labels [N]: the twin's."""
     if config.polish.steps <= 0:
         return motions
     options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
     options |= {"axes": shared_axes(motions.transforms, motions.types), "tau": config.polish.free_static}
     options["stacks"] = judge.stacks if config.polish.free_static > 0 else None
-    lambda_ = config.polish.ssim_lambda
-    fitted, record.together = fit_together(kept, homes, motions, judge.views, config.together, lambda_, **options)
-    if record.together:
+    g, time, lambda_ = learned.gaussians, learned.canonical_time, config.polish.ssim_lambda
+    fitted, record.together = fit_together(g, labels, motions, time, judge.views, config.together, lambda_, **options)
+    if fitted is not motions:
         record.after = fitted.transforms
         measure(record, judge, fitted, level)
     return fitted

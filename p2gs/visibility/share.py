@@ -40,31 +40,23 @@ def footprint(g: GaussianTensors, camera: Camera, pixels: Pixels = PIXELS["class
 
 def visible_share(g: GaussianTensors, cameras: list[Camera], backend: str = "auto") -> Tensor:
     """Greatest share of its footprint that any camera sees of each Gaussian (1: nothing in front; 0: hidden
-    everywhere), [N] on the CPU."""
+    everywhere), [N] on the CPU.
+
+    A Gaussian's weight in an image, summed over pixels, is the derivative of a feature channel's sum by its feature.
+    """
     device = device_of(backend, g.means)  # a phase that is done has its Gaussians on the CPU
-    g, (_, pixels) = g.detach().to(device), split_backend(backend)
+    g = g.detach().to(device)
     best = torch.zeros(len(g), device=device)
-    for camera in (camera.to(device) for camera in cameras):
-        best = torch.maximum(best, _seen(g, camera, backend) / footprint(g, camera, pixels).clamp_min(1e-6))
-    return best.clamp(0, 1).cpu()
-
-
-def seen_pixels(g: GaussianTensors, cameras: list[Camera], backend: str = "auto") -> Tensor:
-    """How many pixels of all cameras' images each Gaussian fills, by its weight in them, [N] on the CPU."""
-    device = device_of(backend, g.means)
-    g, total = g.detach().to(device), torch.zeros(len(g), device=device)
+    features = torch.zeros(len(g), 1, device=device, requires_grad=True)
+    _, pixels = split_backend(backend)
+    options = {"sh_degree": 0, "features": features, "backend": backend}
     for camera in cameras:
-        total += _seen(g, camera.to(device), backend)
-    return total.cpu()
-
-
-def _seen(g: GaussianTensors, camera: Camera, backend: str) -> Tensor:
-    """Each Gaussian's weight in an image, summed over pixels, [N]: the derivative of a feature channel's sum by its
-    feature."""
-    features = torch.zeros(len(g), 1, device=g.means.device, requires_grad=True)
-    out = rasterize(
-        g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh,
-        camera.viewmat, camera.K, camera.width, camera.height, sh_degree=0, features=features, backend=backend,
-    )  # fmt: skip
-    assert out.features is not None
-    return torch.autograd.grad(out.features.sum(), features)[0][:, 0]
+        camera = camera.to(device)
+        out = rasterize(
+            g.means, g.quats, g.log_scales.exp(), torch.sigmoid(g.opacity_logits), g.sh,
+            camera.viewmat, camera.K, camera.width, camera.height, **options,
+        )  # fmt: skip
+        assert out.features is not None
+        (seen,) = torch.autograd.grad(out.features.sum(), features)
+        best = torch.maximum(best, seen[:, 0] / footprint(g, camera, pixels).clamp_min(1e-6))
+    return best.clamp(0, 1).cpu()
