@@ -23,7 +23,7 @@ from p2gs.run_lock import held
 from p2gs.types import UserError
 
 MISTAKE = "error: "  # what a line starts with that tells a user's mistake
-PATIENCE = 60.0  # seconds to save the state in
+PATIENCE = 60.0  # seconds that another program may take: to save its state, to answer
 
 
 def can_run_beside(cfg: RunConfig, device: torch.device, phase: str = "single_state") -> bool:
@@ -45,9 +45,11 @@ def can_run_beside(cfg: RunConfig, device: torch.device, phase: str = "single_st
 
 def takes_processes(device: torch.device) -> bool:
     """Whether a CUDA device is in its default mode, in which several processes may use it; clusters set others. False
-    where the driver's nvidia-smi cannot say."""
-    which = f"GPU-{torch.cuda.get_device_properties(device).uuid}"
-    ask = ["nvidia-smi", "-i", which, "--query-gpu=compute_mode", "--format=csv,noheader"]
+    where the driver's nvidia-smi cannot say, and with a torch (2.2 to 2.4) that does not know which device it is."""
+    uuid = getattr(torch.cuda.get_device_properties(device), "uuid", None)
+    if uuid is None:
+        return False
+    ask = ["nvidia-smi", "-i", f"GPU-{uuid}", "--query-gpu=compute_mode", "--format=csv,noheader"]
     try:
         told = subprocess.run(ask, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout
     except (OSError, subprocess.SubprocessError):

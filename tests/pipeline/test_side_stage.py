@@ -116,4 +116,7 @@ def test_a_gpu_of_one_process_trains_one_state_after_the_other(mode, beside, tmp
     monkeypatch.setattr("p2gs.runtime.side_stage.subprocess.run", nvidia_smi)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid="4f6e"))
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    assert can_run_beside(load_config([str(config(tmp_path))]), torch.device("cuda")) == beside
+    cfg = load_config([str(config(tmp_path))])
+    assert can_run_beside(cfg, torch.device("cuda")) == beside
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace())  # an old torch
+    assert not can_run_beside(cfg, torch.device("cuda"))
