@@ -22,7 +22,7 @@ from p2gs.motion.refine_motions import Judge, single_ways
 from p2gs.motion.screw_polish import PolishConfig, photometric_cost
 from p2gs.motion.survey import leave_false_minima
 from p2gs.ops import se3
-from p2gs.parts.askew import keep_shared, lay_axes
+from p2gs.parts.askew import keep_axes, lay_axes, on_axes
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import drop_needless, drop_untold, own_shares, settle_types
 from p2gs.types import ArticulatedObject, GaussianTensors, Part, Similarity
@@ -39,11 +39,12 @@ class FinishConfig:
     part_penalty: share of the image loss in its own pixels that a part with an axis of its own must save against being
     static or one with a part that it touches, as in discovery (0: parts stay). min_confidence: a part whose joint is
     less likely to be right vanishes (0: none does).
-    askew: share of the image loss that an axis which is askew to the object's directions must save against one along
-    them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less than this many degrees is a
-    slide, and a turn by less is one unless it explains the photographs better by freedom_penalty (share of the image
-    loss), as in discovery. clean_neighbours: labels are the majority among this many neighbours at canonical time (0 =
-    as learned). islands: pieces of a part smaller than this share of its largest go to what they touch (0 = off).
+    askew: share of the image loss in its own pixels that a part must save whose axis is askew to the object's
+    directions, against one along them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less
+    than this many degrees is a slide, and a turn by less is one unless it explains the photographs better by
+    freedom_penalty (share of the image loss), as in discovery. clean_neighbours: labels are the majority among this
+    many neighbours at canonical time (0 = as learned). islands: pieces of a part smaller than this share of its largest
+    go to what they touch (0 = off).
     trays: views of a state by which drawers' trays are found, what is in or on which goes with the drawer (0 = off).
     exports: simulator formats written at the end of a fit, with meshes and report (empty: neither; `p2gs export` makes
     them later). extend_range: joint limits go on beyond the observed motion until the part touches another one (half a
@@ -64,7 +65,7 @@ class FinishConfig:
     min_motion: float = 0.01
     part_penalty: float = PartMotionsConfig.part_penalty
     min_confidence: float = 0.3  # of captures: false parts had 0.27 to 0.29, true ones 0.35 and more
-    askew: float = 0.04  # sharp photographs prefer a plain front beside its place by up to 0.036
+    askew: float = PartMotionsConfig.askew
     prismatic_below: float = 5.0
     freedom_penalty: float = PartMotionsConfig.freedom_penalty
     clean_neighbours: int = 8
@@ -121,7 +122,7 @@ def finish(
     """The twin, one line for each slot that vanished, and what was measured on the way.
 
     views: photographs by state. discovered: motions of the slots before they were learned; slides that went along one
-    direction then may leave it by a degree (``keep_shared``). losses: those of the last training phase, for ``tune``
+    direction then may leave it by a degree (``keep_axes``). losses: those of the last training phase, for ``tune``
     (None: it is left out).
     backend: draws the states, twin_backend: the twin in ``tune`` (None: the same).  A part's confidence is
     ``JointEvidence.confidence`` of its joint.
@@ -147,10 +148,10 @@ def finish(
     if len(types):
         judge = Judge(None, states, views, config.polish, stacks, **options)
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
-        refined, record.laid = _refined(judge, motions, axes, config)
-        refined, labels, left = _founded(record, judge, refined, labels, axes, config, level)
+        refined, axes, record.laid = _refined(judge, motions, axes, config)
+        refined, labels, axes, left = _founded(record, judge, refined, labels, axes, config, level)
         notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
-        refined = _with_gaussians(record, judge, refined, learned, labels, config, level)
+        refined = _with_gaussians(record, judge, refined, learned, labels, axes, config, level)
         types, transforms = refined.types, refined.transforms
     options["backend"] = twin_backend or backend
     gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
@@ -184,16 +185,19 @@ def _typed(learned: Articulation, labels: Tensor, keep: Tensor, below: float) ->
     return types, transforms
 
 
-def _refined(judge: Judge, motions: PartMotions, axes: Tensor, config: FinishConfig) -> tuple[PartMotions, list[dict]]:
-    """The motions as photographs have them, and the axes that were tried along the object's directions; axes [K, 3]:
-    directions that slides share (NaN: none)."""
+def _refined(
+    judge: Judge, motions: PartMotions, axes: Tensor, config: FinishConfig
+) -> tuple[PartMotions, Tensor, list[dict]]:
+    """The motions as photographs have them, the directions [K, 3] that joints keep (NaN: none), and the axes that were
+    tried along the object's directions; axes [K, 3]: directions that slides share."""
     polished = config.polish.steps > 0
     refined = judge.no_worse(motions, judge.refine(motions)) if polished else motions
     refined, _ = leave_false_minima(judge, refined, config.survey)
     if polished:
         refined = settle_types(judge, refined, config.prismatic_below, config.freedom_penalty)
-    refined, laid = lay_axes(judge, refined, config.askew)
-    return keep_shared(judge, refined, axes), laid
+    refined, held, laid = lay_axes(judge, refined, config.askew)
+    axes = torch.where(held.isnan(), axes, held)
+    return keep_axes(judge, refined, axes), axes, laid
 
 
 def _founded(
@@ -204,9 +208,10 @@ def _founded(
     axes: Tensor,
     config: FinishConfig,
     level: int,
-) -> tuple[PartMotions, Tensor, list[tuple[int, str]]]:
-    """The parts that are worth being ones and whose motion photographs tell: their motions, the twin's labels [N], slot
-    and reason of each that vanished; ``record`` says what was measured of them. axes [K, 3]: as for ``_refined``."""
+) -> tuple[PartMotions, Tensor, Tensor, list[tuple[int, str]]]:
+    """The parts that are worth being ones and whose motion photographs tell: their motions, the twin's labels [N], the
+    directions that they keep, slot and reason of each that vanished; ``record`` says what was measured of them. axes
+    [K, 3]: directions that joints keep (NaN: none)."""
     left: list[tuple[int, str]] = []
     motions, labels, gone = drop_needless(judge, motions, labels, config.part_penalty)
     while True:
@@ -214,7 +219,7 @@ def _founded(
             left.append((record.slots.pop(part["part"]), f"vanished: {part['why']}"))
             others = torch.arange(len(axes)) != part["part"]
             record.before, axes = record.before[others], axes[others]
-        motions = keep_shared(judge, motions, axes) if gone else motions
+        motions = keep_axes(judge, motions, axes) if gone else motions
         record.labels, record.after, record.polish, record.evidence = motions.labels, motions.transforms, {}, []
         if len(motions):
             options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
@@ -223,7 +228,7 @@ def _founded(
         trust = [e.confidence for e in record.evidence]
         motions, labels, gone = drop_untold(judge, motions, labels, trust, config.min_confidence)
         if not gone:
-            return motions, labels, left
+            return motions, labels, axes, left
 
 
 def _with_gaussians(
@@ -232,15 +237,16 @@ def _with_gaussians(
     motions: PartMotions,
     learned: Articulation,
     labels: Tensor,
+    axes: Tensor,
     config: FinishConfig,
     level: int,
 ) -> PartMotions:
     """The motions as photographs have them when Gaussians bend with them (``fit_together``); slides of a row keep their
-    direction. labels [N]: the twin's."""
+    direction, and joints one along the object's that they were laid on. labels [N]: the twin's; axes [K, 3]."""
     if config.polish.steps <= 0:
         return motions
     options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
-    options |= {"axes": shared_axes(motions.transforms, motions.types), "tau": config.polish.free_static}
+    options |= {"axes": on_axes(motions, axes), "tau": config.polish.free_static}
     options["stacks"] = judge.stacks if config.polish.free_static > 0 else None
     g, time, lambda_ = learned.gaussians, learned.canonical_time, config.polish.ssim_lambda
     fitted, record.together = fit_together(g, labels, motions, time, judge.views, config.together, lambda_, **options)

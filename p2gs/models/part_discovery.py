@@ -63,7 +63,7 @@ def find_part_motions(
     if joined:
         motions = judge.refine(motions)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
-    motions, laid = lay_axes(judge, motions, config.askew)
+    motions, _, laid = lay_axes(judge, motions, config.askew)
     for part in unfounded:
         say(
             f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence "

@@ -152,18 +152,21 @@ def shared_axes(transforms: Tensor, types: list[str]) -> Tensor:
     return out
 
 
-def hinged_directions(motions: PartMotions) -> Tensor:
-    """[D, 3] (float64) what two hinges' axes agree on to ``KNOWN`` degrees, the mean of each such pair: measured twice
-    by motion, where few points tell which way a top or a front faces. Hinges on one line are one that was found
-    twice."""
+def hinged_directions(motions: PartMotions, faced: Tensor | None = None) -> Tensor:
+    """[D, 3] (float64) what two hinges' axes agree on to ``KNOWN`` degrees, the mean of each such pair, and the axis of
+    each hinge that lies so near to a direction ``faced`` [F, 3] of surfaces: measured by motion, where few points tell
+    which way a top or a front faces. Hinges on one line are one that was found twice."""
     found = [se3.screw_parameters(T.double()) for T, kind in zip(motions.transforms, motions.types, strict=True)
              if kind == "revolute"]  # fmt: skip
+    least = math.cos(math.radians(KNOWN))
     out = []
     for a, b in combinations(found, 2):
         alike, between = a.axis @ b.axis, b.origin - a.origin
         apart = float((between - a.axis * (a.axis @ between)).norm())
-        if abs(float(alike)) > math.cos(math.radians(KNOWN)) and apart > LINE:
+        if abs(float(alike)) > least and apart > LINE:
             out.append(torch.nn.functional.normalize(a.axis + torch.sign(alike) * b.axis, dim=0))
+    if faced is not None and len(faced):
+        out += [a.axis for a in found if float((faced @ a.axis).abs().max()) > least]
     return torch.stack(out) if out else torch.zeros(0, 3).double()
 
 
@@ -189,14 +192,20 @@ def has_own_axis(states: list[StateGaussians], motions: PartMotions, part: int, 
 
 
 def turned_onto(kind: str, T: Tensor, direction: Tensor, middle: Tensor) -> Tensor:
-    """The motion [4, 4] with its axis along ``direction`` [3]: as far as before, a hinge at the place of its line that
-    is nearest to ``middle`` [3], the part's at the start."""
-    axis = axis_of(kind, T)
-    d = direction * torch.sign(direction @ axis)
+    """The motion [4, 4] with its axis along ``direction`` [3]: a slide's part along it; of the turns about it the one
+    that differs by the least angle, at a place where ``middle`` [3], the part's at the start, goes as far across it as
+    it did (no turn about it at all is none)."""
+    d = direction * torch.sign(direction @ axis_of(kind, T))
+    out = torch.eye(4, dtype=T.dtype)
     if kind == "prismatic":
-        out = torch.eye(4, dtype=T.dtype)
         out[:3, 3] = d * (T[:3, 3] @ d)
         return out
-    screw = se3.screw_parameters(T)
-    origin = screw.origin + axis * ((middle - screw.origin) @ axis)
-    return se3.from_screw(d, origin, screw.angle)
+    R = T[:3, :3]
+    skewed = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    angle = torch.atan2(skewed @ d, R.trace() - d @ R @ d)  # where the trace of R^T Rot(d, angle) is greatest
+    across = se3.apply(T, middle[None])[0] - middle
+    across = across - d * (across @ d)
+    if float(angle) == 0:
+        return out
+    to_line = across / 2 + torch.linalg.cross(d, across) / (2 * torch.tan(angle / 2))
+    return se3.from_screw(d, middle + to_line, angle)
