@@ -122,15 +122,20 @@ class Sweep:
     samples: list[Tensor]
     one_sided: bool = False
 
-    def gain(self, weights: list[Tensor], chunk: int = 20000) -> Tensor:
+    def gain(self, weights: list[Tensor], unknown: bool = False, chunk: int = 20000) -> Tensor:
         """Evidence of each motion, points weighted [P0], [P1] (both states' weights sum to at most 2); states must
-        agree, but for what arrives on surfaces of unknown fate where one state shows next to nothing that moved."""
+        agree, but for what arrives on surfaces of ``unknown`` fate, which cannot answer (counted always where one state
+        shows next to nothing that moved)."""
         n = len(weights[0])
         w = torch.zeros(n + len(weights[1]), 2)
         w[:n, 0], w[n:, 1] = weights[0] / 255, weights[1] / 255
         rows = self.evidence.split(chunk)
         a, b = torch.cat([r.float() @ w for r in rows]).T
-        free = torch.cat([(r * (r % 2)).float() @ w for r in rows]).T if self.one_sided else torch.zeros(2, len(a))
+        free = (
+            torch.cat([(r * (r % 2)).float() @ w for r in rows]).T
+            if self.one_sided or unknown
+            else torch.zeros(2, len(a))
+        )
         known = torch.minimum(a - free[0], 3 * b + 0.03) + torch.minimum(b - free[1], 3 * a + 0.03)
         return known + free.sum(0)
 

@@ -54,7 +54,7 @@ def instead_of(
         return []
     own = sided(found.problem, as_motions(transforms, types))
     rest = search.pool.add(own if part is None else without(own, part)).tolist()
-    motions, _ = search.propose(rest, 96, 12, each=True)
+    motions, _ = search.propose(rest, 192, 12, each=True, unknown=True)
     if not len(motions):
         return []
     index = search.pool.add(motions).tolist()

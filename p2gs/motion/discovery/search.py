@@ -68,19 +68,25 @@ class Search:
         self.trace: list[dict] = []
 
     def propose(
-        self, chosen: list[int], count: int, fine: int, extra: Motions | None = None, each: bool = False
+        self,
+        chosen: list[int],
+        count: int,
+        fine: int,
+        extra: Motions | None = None,
+        each: bool = False,
+        unknown: bool = False,
     ) -> tuple[Motions, Tensor]:
         """The ``fine`` best sharpened motions for what the motions ``chosen`` leave over, and their gains.
 
         each: as many slides as turns, since among many turns one often fits by chance a little better than a true
-        slide.
+        slide.  unknown: as in ``Sweep.gain``.
         """
         left = [(1 - a).clamp(0, 1) for a in self.pool.explained(chosen)]
         weights = [
             w.sum() * (x * w)[r] / w[r].sum().clamp_min(1e-9)
             for x, w, r in zip(left, self.problem.weights, self.sweep_rows, strict=True)
         ]
-        g = self.swept.gain(weights)
+        g = self.swept.gain(weights, unknown)
         slide = ~self.swept.motions.turn
         tops = [
             distinct(self.swept.motions, torch.where(kind, g, -torch.ones_like(g)), self.probe, self.radius, n)
