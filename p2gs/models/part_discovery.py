@@ -25,6 +25,7 @@ from p2gs.parts.bodies import Surfaces, one_part_a_body
 from p2gs.parts.expand import expand
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import join_twins, settle_types, simplify
+from p2gs.parts.seams import join_seamless
 from p2gs.parts.seek import seek
 from p2gs.parts.settle import drop_unfounded, reconsider, settle_labels
 from p2gs.parts.slots import merge_to
@@ -62,6 +63,7 @@ def find_part_motions(
     motions, joined = join_twins(states, motions, found.problem.scale.apart)
     if joined:
         motions = judge.refine(motions)
+    motions, seamless = join_seamless(judge, motions)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
     motions, _, laid = lay_axes(judge, motions, config.askew)
     for part in unfounded:
@@ -79,6 +81,7 @@ def find_part_motions(
         **improved,
         "rounds": rounds,
         "joined": joined,
+        "seamless": seamless,
         "unfounded": unfounded,
         "laid": laid,
         **_plain(found.diagnostics),

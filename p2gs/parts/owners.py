@@ -20,7 +20,7 @@ from p2gs.ops import se3
 from p2gs.ops.blend import likeliest
 from p2gs.parts.patches import patches
 from p2gs.render.base import MAX_FEATURES
-from p2gs.types import GaussianTensors
+from p2gs.types import Camera, GaussianTensors, RenderOutput
 from p2gs.visibility.depth_stack import DepthStack
 from p2gs.visibility.free_space import SEEN, SURFACE, landed, out_of_sight
 
@@ -33,15 +33,22 @@ LEAST = 0.1  # share of the views in which that one must
 @torch.no_grad()
 def label_maps(g: GaussianTensors, labels: Tensor, count: int, stack: DepthStack, backend: str, device) -> Tensor:
     """What part covers most of each pixel of the stack's views, [V, H, W] int64. labels [N] in 0..count-1."""
-    chunks = torch.nn.functional.one_hot(labels, count).float().split(MAX_FEATURES, 1)
     g, maps = g.to(device), torch.zeros(stack.depth.shape, dtype=torch.int64)
     for out, camera in zip(maps, stack.cameras, strict=True):
-        shares = [
-            render_gaussians(g, camera.to(device), features=c.to(device), backend=backend).painted.cpu() for c in chunks
-        ]
-        share = torch.cat(shares, -1)
-        out[: camera.height, : camera.width] = likeliest(share.flatten(0, 1)).reshape(share.shape[:2])
+        out[: camera.height, : camera.width] = label_map(g, labels, count, camera, backend, device)[0]
     return maps
+
+
+@torch.no_grad()
+def label_map(
+    g: GaussianTensors, labels: Tensor, count: int, camera: Camera, backend: str, device
+) -> tuple[Tensor, RenderOutput]:
+    """What part covers most of each pixel of a view, [H, W] int64, and the view; g on ``device``, labels [N] in
+    0..count-1."""
+    chunks = torch.nn.functional.one_hot(labels, count).float().split(MAX_FEATURES, 1)
+    drawn = [render_gaussians(g, camera.to(device), features=c.to(device), backend=backend) for c in chunks]
+    share = torch.cat([out.painted.cpu() for out in drawn], -1)
+    return likeliest(share.flatten(0, 1)).reshape(share.shape[:2]), drawn[0]
 
 
 def hiders(points: Tensor, stack: DepthStack, maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
