@@ -362,5 +362,6 @@ def test_what_arrives_on_surface_of_unknown_fate_need_not_be_answered():
     evidence = torch.tensor([[0, 0, 254, 254], [0, 0, 255, 255], [254, 254, 254, 254]], dtype=torch.uint8)
     half = torch.full((2,), 0.5)
     for one_sided, unknown in ((True, 1.0), (False, 0.03)):
-        gain = Sweep(motions, evidence, [torch.arange(2)] * 2, one_sided).gain([half, half])
-        assert gain.tolist() == pytest.approx([0.03, unknown, 2 * 254 / 255])
+        swept = Sweep(motions, evidence, [torch.arange(2)] * 2, one_sided)
+        assert swept.gain([half, half]).tolist() == pytest.approx([0.03, unknown, 2 * 254 / 255])
+        assert swept.gain([half, half], unknown=True).tolist() == pytest.approx([0.03, 1.0, 2 * 254 / 255])
