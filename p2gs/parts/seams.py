@@ -24,6 +24,7 @@ FEWEST = 10  # pixels of common border by which a photograph shows two parts bes
 # share of such photographs without an edge, in either state, above which two parts are one: of seventeen pairs of true
 # parts of twelve objects at most 0.50, of two plates torn in two 0.79 and 1
 MOST = 2 / 3
+EIGHT = np.ones((3, 3), bool)  # neighbours of a pixel
 
 
 def join_seamless(judge: Judge, motions: PartMotions) -> tuple[PartMotions, list[dict]]:
@@ -68,9 +69,6 @@ def _seen(judge: Judge, motions: PartMotions, state: int) -> dict[tuple[int, int
     return out
 
 
-EIGHT = np.ones((3, 3), bool)  # neighbours of a pixel
-
-
 def touching(one: np.ndarray, two: np.ndarray, depth: np.ndarray, near: float) -> int:
     """How many pixels of two regions [H, W] lie beside one of the other at the same depth [H, W], to within
     ``near``."""
@@ -85,7 +83,7 @@ def touching(one: np.ndarray, two: np.ndarray, depth: np.ndarray, near: float) -
 def contrast_of(image: Tensor) -> np.ndarray:
     """[H, W] how much an image [H, W, 3], smoothed over three pixels, varies within ``EDGE`` pixels of each pixel, mean
     of the channels."""
-    smooth = ndimage.uniform_filter(image.numpy(), (3, 3, 0))
+    smooth = ndimage.uniform_filter(image.numpy(), (3, 3, 0))  # pyright: ignore
     size = (2 * EDGE + 1, 2 * EDGE + 1, 0)
     return (ndimage.maximum_filter(smooth, size) - ndimage.minimum_filter(smooth, size)).mean(2)
 
@@ -106,12 +104,16 @@ def parted_by_an_edge(contrast: np.ndarray, one: np.ndarray, two: np.ndarray) ->
             high = level
         else:
             low = level + 1
-    piece, _ = ndimage.label((contrast <= levels[low]) & both, EIGHT)
+    piece = _pieces((contrast <= levels[low]) & both)
     shares = [np.bincount(piece[region], minlength=piece.max() + 1)[1:] / region.sum() for region in (one, two)]
     return not bool(((shares[0] >= 0.5) & (shares[1] >= 0.5)).any())
 
 
 def _largest(open_: np.ndarray, region: np.ndarray) -> int:
     """Pixels of the largest piece of a region [H, W] where it is open."""
-    piece, count = ndimage.label(open_ & region, EIGHT)
-    return int(np.bincount(piece.ravel())[1:].max()) if count else 0
+    return int(np.bincount(_pieces(open_ & region).ravel(), minlength=2)[1:].max())
+
+
+def _pieces(mask: np.ndarray) -> np.ndarray:
+    """[H, W] the number of each pixel's connected component of the mask [H, W], 0 outside it."""
+    return ndimage.label(mask, EIGHT)[0]  # pyright: ignore
