@@ -39,12 +39,12 @@ class FinishConfig:
     part_penalty: share of the image loss in its own pixels that a part with an axis of its own must save against being
     static or one with a part that it touches, as in discovery (0: parts stay). min_confidence: a part whose joint is
     less likely to be right vanishes (0: none does).
-    askew: share of the image loss in its own pixels that a part must save whose axis is askew to the object's
-    directions, against one along them (0: axes stay). prismatic_below: a free motion (paper's start) that turns by less
-    than this many degrees is a slide, and a turn by less is one unless it explains the photographs better by
-    freedom_penalty (share of the image loss), as in discovery. clean_neighbours: labels are the majority among this
-    many neighbours at canonical time (0 = as learned). islands: pieces of a part smaller than this share of its largest
-    go to what they touch (0 = off).
+    askew: share of the image loss that an axis which is askew to the object's directions must save against one along
+    them (0: axes stay), or part_penalty in its own pixels where it is far from them. prismatic_below: a free motion
+    (paper's start) that turns by less than this many degrees is a slide, and a turn by less is one unless it explains
+    the photographs better by freedom_penalty (share of the image loss), as in discovery. clean_neighbours: labels are
+    the majority among this many neighbours at canonical time (0 = as learned). islands: pieces of a part smaller than
+    this share of its largest go to what they touch (0 = off).
     trays: views of a state by which drawers' trays are found, what is in or on which goes with the drawer (0 = off).
     exports: simulator formats written at the end of a fit, with meshes and report (empty: neither; `p2gs export` makes
     them later). extend_range: joint limits go on beyond the observed motion until the part touches another one (half a
@@ -65,7 +65,7 @@ class FinishConfig:
     min_motion: float = 0.01
     part_penalty: float = PartMotionsConfig.part_penalty
     min_confidence: float = 0.3  # of captures: false parts had 0.27 to 0.29, true ones 0.35 and more
-    askew: float = PartMotionsConfig.askew
+    askew: float = 0.04  # sharp photographs prefer a plain front beside its place by up to 0.036
     prismatic_below: float = 5.0
     freedom_penalty: float = PartMotionsConfig.freedom_penalty
     clean_neighbours: int = 8
@@ -195,7 +195,7 @@ def _refined(
     refined, _ = leave_false_minima(judge, refined, config.survey)
     if polished:
         refined = settle_types(judge, refined, config.prismatic_below, config.freedom_penalty)
-    refined, held, laid = lay_axes(judge, refined, config.askew)
+    refined, held, laid = lay_axes(judge, refined, config.askew, config.part_penalty)
     axes = torch.where(held.isnan(), axes, held)
     return keep_axes(judge, refined, axes), axes, laid
 

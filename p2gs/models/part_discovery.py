@@ -65,7 +65,7 @@ def find_part_motions(
         motions = judge.refine(motions)
     motions, seamless = join_seamless(judge, motions)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
-    motions, _, laid = lay_axes(judge, motions, config.askew)
+    motions, _, laid = lay_axes(judge, motions, config.askew, config.part_penalty)
     for part in unfounded:
         say(
             f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence "

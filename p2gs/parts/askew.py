@@ -10,20 +10,33 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
-from p2gs.motion.directions import KNOWN, SQUARE, axis_of, directions_of, hinged_directions, shared_axes, turned_onto
+from p2gs.motion.directions import (
+    KNOWN,
+    SQUARE,
+    WITHIN,
+    axis_of,
+    directions_of,
+    hinged_directions,
+    shared_axes,
+    turned_onto,
+)
 from p2gs.motion.discovery.rigid import one_way
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.relabel import relabelled
 
 
-def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMotions, Tensor, list[dict]]:
+def lay_axes(
+    judge: Judge, motions: PartMotions, price: float, further: float
+) -> tuple[PartMotions, Tensor, list[dict]]:
     """Each joint's axis that is askew to the directions of the object (its surfaces' and what two hinges agree on) on
-    the nearest of them, the rest refined, unless the part's own pixels lose more than ``price`` by it
-    (``Judge.own_share``; 0, or no refinement: none is laid); with labels chosen anew where the judge has discovery's
-    surfaces. Of several measures of one direction, a hinge's and the surfaces', the one that gains most.
+    the nearest of them, the rest refined, where that costs at most ``price`` of energy (``Judge.gain``; 0, or no
+    refinement: none is laid), and if it is farther off than ``WITHIN``, so that it need not be meant to lie there, at
+    most ``further`` of the image loss in the part's own pixels (``Judge.own_share``); with labels chosen anew where the
+    judge has discovery's surfaces. Of several measures of one direction, a hinge's and the surfaces', the one that
+    gains most.
 
     Returns the motions, the directions [K, 3] that axes were laid on (NaN: none), and what was tried: part, type,
-    degrees off, what it gained and saved in its own pixels.
+    degrees off, what it gained and saved in its own pixels, whether it was taken.
     """
     log: list[dict] = []
     held = torch.full((len(motions), 3), math.nan, dtype=torch.float64)
@@ -45,8 +58,9 @@ def lay_axes(judge: Judge, motions: PartMotions, price: float) -> tuple[PartMoti
         )
         saved = judge.own_share(laid, motions)
         off = math.degrees(math.acos(min(1.0, float(along.max()))))
-        log.append({"part": k, "type": kind, "degrees": off, "gained": gained, "own_share": saved})
-        if saved >= -price:
+        taken = gained >= -price and (off <= WITHIN or saved >= -further)
+        log.append({"part": k, "type": kind, "degrees": off, "gained": gained, "own_share": saved, "laid": taken})
+        if taken:
             motions, held = laid, axes
     return motions, held, log
 

@@ -31,8 +31,8 @@ class PartMotionsConfig:
     of a hundredth of the moved surface 0.38.
     min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to
     nothing of it.
-    askew: share of the image loss in its own pixels that a part must save whose axis is askew to the directions of the
-    object, against one along them (0: axes stay).
+    askew: share of the image loss that an axis must save which is askew to the directions that the object has, against
+    one along them (0: axes stay), or part_penalty in its own pixels where it is far from them.
     """
 
     evidence_size: int = 200
@@ -49,6 +49,6 @@ class PartMotionsConfig:
     reconsider: bool = True
     seek: float = 0.3
     min_confidence: float = 0.02
-    askew: float = part_penalty
+    askew: float = 0.01
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))

@@ -164,6 +164,7 @@ class Told:
     best: torch.Tensor
     slope: float
     config: PolishConfig
+    own: float = 1.0  # times what it costs in all pixels it costs in a part's own
     found = None
 
     def __call__(self, motions):
@@ -172,7 +173,8 @@ class Told:
     def gain(self, tried, than):
         return self(than)[0] - self(tried)[0]
 
-    own_share = gain
+    def own_share(self, tried, than):
+        return self.own * self.gain(tried, than)
 
     def refine(self, motions, axes=None):
         return motions
@@ -187,26 +189,28 @@ def askew(degrees: float) -> PartMotions:
 
 
 @pytest.mark.parametrize(
-    "degrees, slope, laid",
+    "degrees, slope, own, laid",
     [
-        (5.0, 0.001, True),  # photographs hardly tell: half a hundredth is lost
-        (5.0, 0.01, False),  # they do
-        (0.8, 0.001, False),  # directions are not known better than that
-        (25.0, 0.0, True),  # however far off
-        (25.0, 0.001, False),
+        (5.0, 0.001, 1.0, True),  # photographs hardly tell: half a hundredth is lost
+        (5.0, 0.001, 20.0, True),  # a tenth in the part's own pixels
+        (5.0, 0.01, 1.0, False),  # they do
+        (0.8, 0.001, 1.0, False),  # directions are not known better than that
+        (25.0, 0.0002, 2.0, True),  # however far off
+        (25.0, 0.0002, 20.0, False),  # but not if its own pixels lose a tenth
+        (25.0, 0.001, 1.0, False),
     ],
 )
-def test_an_axis_askew_is_laid_where_that_costs_next_to_nothing(degrees, slope, laid):
+def test_an_axis_askew_is_laid_where_that_costs_next_to_nothing(degrees, slope, own, laid):
     motions = askew(degrees)
-    judge = Told([cube(0), cube(1)], axis_of("prismatic", motions.transforms[0]), slope, PolishConfig())
-    found, axes, log = lay_axes(judge, motions, 0.01)
+    judge = Told([cube(0), cube(1)], axis_of("prismatic", motions.transforms[0]), slope, PolishConfig(), own)
+    found, axes, log = lay_axes(judge, motions, 0.01, 0.02)
     off = degrees_between(axis_of("prismatic", found.transforms[0]), UP)
     assert off < 0.1 if laid else off == pytest.approx(degrees, abs=1e-4)
     assert len(log) == (degrees > 1) and bool(axes.isnan().any()) != laid
     assert torch.equal(on_axes(found, axes).nan_to_num(), axes.nan_to_num())
-    assert lay_axes(judge, motions, 0.0)[::2] == (motions, [])  # switched off
+    assert lay_axes(judge, motions, 0.0, 0.02)[::2] == (motions, [])  # switched off
     judge.config = PolishConfig(steps=0)
-    assert lay_axes(judge, motions, 0.01)[::2] == (motions, [])  # screws stay as they were learned
+    assert lay_axes(judge, motions, 0.01, 0.02)[::2] == (motions, [])  # screws stay as they were learned
 
 
 def test_of_several_measures_of_a_direction_the_one_that_explains_most_is_taken():
@@ -216,7 +220,7 @@ def test_of_several_measures_of_a_direction_the_one_that_explains_most_is_taken(
     motions = askew(6.0).with_motion(1, "revolute", hinge)
     motions.labels = [torch.where(torch.arange(2400) > 2350, 2, of) for of in motions.labels]
     judge = Told([cube(0), cube(1)], best, 0.001, PolishConfig())
-    found, axes, log = lay_axes(judge, motions, 0.01)
+    found, axes, log = lay_axes(judge, motions, 0.01, 0.02)
     assert [told["part"] for told in log] == [0] and torch.equal(found.transforms[1], hinge)
     assert degrees_between(axis_of("prismatic", found.transforms[0]), best) < 1e-4
     assert degrees_between(axes[0], best) < 1e-4 and bool(axes[1].isnan().all())
