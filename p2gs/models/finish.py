@@ -38,7 +38,7 @@ class FinishConfig:
     of the solid Gaussians vanishes. min_motion: likewise one that moves its points by less (internal units).
     part_penalty: share of the image loss in its own pixels that a part with an axis of its own must save against being
     static or one with a part that it touches, as in discovery (0: parts stay). min_confidence: a part whose joint is
-    less likely to be right vanishes (0: none does).
+    less likely to be right vanishes, but for the only one (0: none does).
     askew: share of the image loss that an axis which is askew to the object's directions must save against one along
     them (0: axes stay), or part_penalty in its own pixels where it is far from them. prismatic_below: a free motion
     (paper's start) that turns by less than this many degrees is a slide, and a turn by less is one unless it explains

@@ -77,8 +77,8 @@ def drop_untold(
 ) -> tuple[PartMotions, Tensor, list[dict]]:
     """The motions and the twin's labels [N] without the part of least confidence where that is below ``least``, the
     rest refined again (no refinement: all stay); and, if it went, which it was and a sentence ``why``. trust: of each
-    part, as the final motions were measured."""
-    if not trust or judge.config.steps <= 0 or min(trust) >= least:
+    part, as the final motions were measured. The only part stays: something moved, however badly its motion is told."""
+    if len(trust) < 2 or judge.config.steps <= 0 or min(trust) >= least:
         return motions, labels, []
     part = trust.index(min(trust))
     why = f"photographs do not tell its motion (confidence {trust[part]:.2f})"

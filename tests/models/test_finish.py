@@ -176,6 +176,8 @@ def test_the_part_that_photographs_tell_least_of_goes():
     states, _, cut, motions = halved("revolute", hinge(), hinge())
     judge = Told(states, cut > 0, 1.0, PolishConfig())
     assert drop_untold(judge, motions, cut, [0.5, 0.02], 0.02) == (motions, cut, [])
+    alone, only = without_part(motions, 1, 1), cut.clamp_max(1)
+    assert drop_untold(judge, alone, only, [0.01], 0.02) == (alone, only, [])  # something moved
     kept, relabelled, (gone,) = drop_untold(judge, motions, cut, [0.5, 0.01], 0.02)
     assert len(kept) == 1 and gone["part"] == 1 and "0.01" in gone["why"]
     assert torch.equal(relabelled, torch.where(cut == 2, 0, cut)) and torch.equal(kept.labels[0], relabelled)
