@@ -200,12 +200,10 @@ def turned_onto(kind: str, T: Tensor, direction: Tensor, middle: Tensor) -> Tens
     if kind == "prismatic":
         out[:3, 3] = d * (T[:3, 3] @ d)
         return out
-    R = T[:3, :3]
-    skewed = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    angle = torch.atan2(skewed @ d, R.trace() - d @ R @ d)  # where the trace of R^T Rot(d, angle) is greatest
-    across = se3.apply(T, middle[None])[0] - middle
-    across = across - d * (across @ d)
+    q = so3.matrix_to_quat(T[:3, :3])
+    angle = 2 * torch.atan2(q[1:] @ d, q[0])  # the twist about d
     if float(angle) == 0:
         return out
-    to_line = across / 2 + torch.linalg.cross(d, across) / (2 * torch.tan(angle / 2))
-    return se3.from_screw(d, middle + to_line, angle)
+    across = se3.apply(T, middle[None])[0] - middle
+    R = so3.rotvec_to_matrix(d * angle)
+    return se3.make(R, middle + across - d * (across @ d) - R @ middle)

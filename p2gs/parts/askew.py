@@ -69,11 +69,10 @@ def keep_axes(judge: Judge, motions: PartMotions, axes: Tensor) -> PartMotions:
     """The motions with the joints that have a direction, ``axes`` [K, 3] (NaN: none), laid on it again and refined with
     it held, if photographs took any of them farther than ``KNOWN`` from it. Each by itself, a shut drawer's plain front
     or a round handle hardly tells which way it went."""
-    held, strayed = ~axes.isnan().any(1), False
-    for k in held.nonzero()[:, 0].tolist():
-        along = float((axis_of(motions.types[k], motions.transforms[k]).double() @ axes[k]).abs())
-        strayed |= along < math.cos(math.radians(KNOWN))
-    return judge.refine(_onto(judge, motions, held.nonzero()[:, 0].tolist(), axes), axes) if strayed else motions
+    held = (~axes.isnan().any(1)).nonzero()[:, 0].tolist()
+    along = [float((axis_of(motions.types[k], motions.transforms[k]).double() @ axes[k]).abs()) for k in held]
+    strayed = min(along, default=1.0) < math.cos(math.radians(KNOWN))
+    return judge.refine(_onto(judge, motions, held, axes), axes) if strayed else motions
 
 
 def on_axes(motions: PartMotions, axes: Tensor) -> Tensor:

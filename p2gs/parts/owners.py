@@ -33,20 +33,18 @@ LEAST = 0.1  # share of the views in which that one must
 @torch.no_grad()
 def label_maps(g: GaussianTensors, labels: Tensor, count: int, stack: DepthStack, backend: str, device) -> Tensor:
     """What part covers most of each pixel of the stack's views, [V, H, W] int64. labels [N] in 0..count-1."""
-    g, maps = g.to(device), torch.zeros(stack.depth.shape, dtype=torch.int64)
+    g, shares = g.to(device), torch.nn.functional.one_hot(labels, count).float().to(device)
+    maps = torch.zeros(stack.depth.shape, dtype=torch.int64)
     for out, camera in zip(maps, stack.cameras, strict=True):
-        out[: camera.height, : camera.width] = label_map(g, labels, count, camera, backend, device)[0]
+        out[: camera.height, : camera.width] = label_map(g, shares, camera.to(device), backend)[0]
     return maps
 
 
 @torch.no_grad()
-def label_map(
-    g: GaussianTensors, labels: Tensor, count: int, camera: Camera, backend: str, device
-) -> tuple[Tensor, RenderOutput]:
-    """What part covers most of each pixel of a view, [H, W] int64, and the view; g on ``device``, labels [N] in
-    0..count-1."""
-    chunks = torch.nn.functional.one_hot(labels, count).float().split(MAX_FEATURES, 1)
-    drawn = [render_gaussians(g, camera.to(device), features=c.to(device), backend=backend) for c in chunks]
+def label_map(g: GaussianTensors, shares: Tensor, camera: Camera, backend: str) -> tuple[Tensor, RenderOutput]:
+    """What part covers most of each pixel of a view, [H, W] int64 on the CPU, and the view. shares [N, K]: of each part
+    in each Gaussian, on the same device."""
+    drawn = [render_gaussians(g, camera, features=c, backend=backend) for c in shares.split(MAX_FEATURES, 1)]
     share = torch.cat([out.painted.cpu() for out in drawn], -1)
     return likeliest(share.flatten(0, 1)).reshape(share.shape[:2]), drawn[0]
 

@@ -55,10 +55,11 @@ def _seen(judge: Judge, motions: PartMotions, state: int) -> dict[tuple[int, int
     """Of each two parts of a state, of every photograph that shows them beside each other whether no edge parts
     them."""
     views, g = judge.views[state], judge.states[state].gaussians.to(judge.device)
-    labels, out = motions.labels[state].clamp_min(0), {}
+    shares = torch.nn.functional.one_hot(motions.labels[state].clamp_min(0), len(motions) + 1).float().to(judge.device)
+    out: dict[tuple[int, int], list[bool]] = {}
     for i in views.spread(VIEWS):
         shot = views.get(i, len(views.levels) - 1, torch.full((3,), 0.5))
-        part, drawn = label_map(g, labels, len(motions) + 1, shot.camera, judge.backend, judge.device)
+        part, drawn = label_map(g, shares, shot.camera.to(judge.device), judge.backend)
         part = torch.where(drawn.alpha.cpu() > 0.5, part, -1).numpy()
         contrast, depth = contrast_of(shot.image), drawn.expected_depth.cpu().numpy()
         for a, b in combinations(range(len(motions)), 2):

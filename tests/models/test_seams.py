@@ -10,6 +10,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
+from p2gs.ops.sh import C0
 from p2gs.parts.seams import EDGE, contrast_of, join_seamless, parted_by_an_edge, seamless
 from p2gs.types import GaussianTensors
 from tests.models.tiny import photographs
@@ -60,7 +61,7 @@ def plates(right: float) -> tuple[GaussianTensors, torch.Tensor]:
     means = torch.stack([torch.full((len(points),), 0.2), *points.T], 1)
     labels = torch.where(points[:, 0] < 0, 1, 2)
     colour = torch.where(labels == 2, right, 0.5)
-    sh = ((colour - 0.5) / 0.28209479)[:, None, None].expand(-1, 1, 3).contiguous()
+    sh = ((colour - 0.5) / C0)[:, None, None].expand(-1, 1, 3).contiguous()
     quats = torch.tensor([1.0, 0, 0, 0]).repeat(len(points), 1)
     scales = torch.tensor([0.004, 0.03, 0.03]).log().repeat(len(points), 1)
     return GaussianTensors(means, quats, scales, torch.full((len(points),), 4.0), sh), labels
