@@ -1,10 +1,10 @@
-"""Expansion: a part takes the whole static surface, if the energy of the labels falls by it.
+"""Expansion: a part takes surface that could as well stand still, or another part's, if the energy falls by it.
 
 A plain side that slides along itself lies on itself in both states, so surfaces call it static wherever nothing else
-speaks. Where nothing of the object stands still (a box pulled out of a wall that is not in the pictures), that leaves a
-rigid body torn in two, and another part is found to cover the gap. A move of graph cuts (Boykov, Veksler and Zabih
-2001, DOI 10.1109/34.969114), with a whole label for the expanding set: what a cut would choose is decided by
-photographs, which know no edges between two Gaussians.
+speaks: a rigid body is torn in two, and another part is found to cover the gap. So each part is tried with what a cut
+gives it of the static surface and of another part's (``label_cut.spread``); and, as nothing of an object may stand
+still (a box pulled out of a wall that is not in the pictures), with all static surface, or with everything.
+Photographs, not the cut, decide.
 """
 
 from __future__ import annotations
@@ -16,23 +16,43 @@ import torch
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.refine_motions import Judge
+from p2gs.parts.label_cut import spread
+from p2gs.parts.part_choices import without_part
 
 
 def expand(judge: Judge, motions: PartMotions) -> tuple[PartMotions, list[dict]]:
-    """Motions and labels of lowest energy, after parts took the static surface or the whole object; what was taken."""
-    best, taken = motions, []
-    for how, part, tried in expansions(motions):
-        if judge.gain(tried, best) > 0:
-            best, taken = tried, [{"change": how, "part": part, "energy": -judge.gain(tried, motions)}]
-    return best, taken
+    """Motions and labels of lowest energy, after parts took what is theirs; what was taken. What a part takes must save
+    as much of the image loss in its own pixels (``Judge.own_share``) as a further part must: where photographs hardly
+    tell, surface stays still."""
+    taken: list[dict] = []
+    while len(motions):
+        best = None
+        for how, part, tried in expansions(judge, motions):
+            gained = judge.gain(tried, motions)
+            if gained <= (0 if best is None else -best[0]["energy"]):
+                continue
+            own = judge.own_share(tried, motions)
+            if own >= judge.further:
+                best = {"change": how, "part": part, "own_share": own, "energy": -gained}, tried
+        if best is None:
+            break
+        taken.append(best[0])
+        motions = best[1]
+    return motions, taken
 
 
-def expansions(motions: PartMotions) -> Iterator[tuple[str, int, PartMotions]]:
-    """For each part: with the static surface its own, and, of several, with everything its own and no other part: (how,
-    part, motions)."""
+def expansions(judge: Judge, motions: PartMotions) -> Iterator[tuple[str, int, PartMotions]]:
+    """For each part, (how, part, motions): with all static surface its own; of several, with that of the static surface
+    and of another part that the cut gives it, where that is most of the other's, which goes; with everything."""
     for k in range(len(motions)):
         labels = [torch.where(own == 0, k + 1, own) for own in motions.labels]
         yield "took the static surface", k, replace(motions, labels=labels)
+        for other in range(len(motions)):
+            if other != k:
+                left = k - (k > other)
+                tried = spread(judge, without_part(motions, other, 0), left)
+                if _most(motions, other, tried, left):
+                    yield f"took part {other}", k, tried
         if len(motions) > 1:
             one = replace(
                 motions,
@@ -42,3 +62,12 @@ def expansions(motions: PartMotions) -> Iterator[tuple[str, int, PartMotions]]:
                 labels=[torch.ones_like(own) for own in motions.labels],
             )
             yield "took the whole object", k, one
+
+
+def _most(motions: PartMotions, other: int, tried: PartMotions, k: int) -> bool:
+    """Whether part ``k`` of ``tried`` has most of what part ``other`` of ``motions`` had in each state."""
+    shares = [
+        float((new[own == other + 1] == k + 1).float().mean()) if bool((own == other + 1).any()) else 1.0
+        for own, new in zip(motions.labels, tried.labels, strict=True)
+    ]
+    return min(shares) > 0.5

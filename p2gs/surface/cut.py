@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from p2gs.native import native
+from p2gs.ops.graph_cut import cut_of_edges
 
 VOTE = 256  # capacity of a whole vote: votes are rounded to this share of one
 WAYS = 6  # neighbours of a cell, those along one axis in turn, so that way ^ 1 leads back
@@ -56,21 +57,5 @@ def least_cut(neighbours: np.ndarray, capacity: np.ndarray, pull: np.ndarray) ->
 
 def least_cut_reference(neighbours: np.ndarray, capacity: np.ndarray, pull: np.ndarray) -> tuple[int, np.ndarray]:
     """``least_cut`` by scipy's maximum flow."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
-
-    n = len(pull)
     node, way = np.nonzero(neighbours >= 0)
-    up, down = np.nonzero(pull > 0)[0], np.nonzero(pull < 0)[0]
-    tail = np.r_[node, np.full(len(up), n), down]
-    head = np.r_[neighbours[node, way], up, np.full(len(down), n + 1)]
-    edges = np.r_[capacity[node, way], pull[up], -pull[down]].astype(np.int32)
-    graph = csr_matrix((edges, (tail, head)), (n + 2, n + 2))
-    result = maximum_flow(graph, n, n + 1)
-    left = (graph - result.flow).tocsr()
-    left.data[left.data < 0] = 0
-    left.eliminate_zeros()
-    side = np.full(n + 2, 2, np.uint8)
-    side[breadth_first_order(left, n, return_predecessors=False)] = 1
-    side[breadth_first_order(left.T.tocsr(), n + 1, return_predecessors=False)] = 0
-    return int(result.flow_value), side[:n]
+    return cut_of_edges(node, neighbours[node, way], capacity[node, way], pull)

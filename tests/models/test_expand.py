@@ -6,6 +6,9 @@ import torch
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.parts.expand import expand, expansions
+from p2gs.types import GaussianTensors
+
+WHOLE = ("took the static surface", "took the whole object")
 
 
 def two_parts() -> PartMotions:
@@ -16,8 +19,8 @@ def two_parts() -> PartMotions:
 
 
 def test_expansions_are_each_parts_with_the_static_surface_and_with_everything():
-    found = {(how, k): m for how, k, m in expansions(two_parts())}
-    assert len(found) == 4
+    found = {(how, k): m for how, k, m in expansions(judge_by(len), two_parts())}
+    assert found.keys() == {(how, k) for how in WHOLE for k in (0, 1)}
     assert found["took the static surface", 1].labels[0].tolist() == [2, 2, 1, 1, 2]
     whole = found["took the whole object", 1]
     assert (
@@ -28,8 +31,18 @@ def test_expansions_are_each_parts_with_the_static_surface_and_with_everything()
     assert all(bool((own == 1).all()) for own in whole.labels)
 
 
-def judge_by(energy):
-    return SimpleNamespace(gain=lambda tried, than: energy(than) - energy(tried))
+def judge_by(energy, share=0.2):
+    """A judge by ``energy`` of five Gaussians a state, too few for a cut."""
+    five = GaussianTensors(*(torch.zeros(5, *shape) for shape in ((3,), (4,), (3,), (), (1, 3))))
+    states = [SimpleNamespace(state=s, gaussians=five) for s in (0, 1)]
+    seen = [SimpleNamespace(kept=torch.ones(5, dtype=torch.bool), lit=five)] * 2
+    return SimpleNamespace(
+        states=states,
+        seen=lambda motions: seen,
+        gain=lambda tried, than: energy(than) - energy(tried),
+        own_share=lambda tried, than: share,
+        further=0.15,
+    )
 
 
 def test_the_expansion_of_lowest_energy_is_taken_and_none_that_is_higher():
@@ -37,7 +50,15 @@ def test_the_expansion_of_lowest_energy_is_taken_and_none_that_is_higher():
         return float(sum((own == 0).sum() for own in m.labels))
 
     motions, log = expand(judge_by(lambda m: static(m) + len(m)), two_parts())
-    assert len(motions) == 1 and log == [{"change": "took the whole object", "part": 0, "energy": -4.0}]
+    assert len(motions) == 1 and log == [
+        {"change": "took the whole object", "part": 0, "own_share": 0.2, "energy": -4.0}
+    ]
     start = two_parts()
     motions, log = expand(judge_by(lambda m: -static(m)), start)
+    assert motions is start and log == []
+
+
+def test_an_expansion_that_photographs_hardly_tell_is_not_taken():
+    start = two_parts()
+    motions, log = expand(judge_by(lambda m: float(sum((own == 0).sum() for own in m.labels)), share=0.1), start)
     assert motions is start and log == []
