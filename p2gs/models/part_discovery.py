@@ -56,8 +56,11 @@ def find_part_motions(
     explanations, looks = _looked_at(judge, _explanations(found), config, say)
     motions, compared = _compared(judge, explanations, config, say)
     motions, expanded = expand(judge, motions)
-    limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
+    limit, known = (config.search.max_parts if num_parts == "auto" else num_parts) - 1, len(motions)
     motions, improved = _improved(judge, motions, limit, config, say)
+    if len(motions) > known:  # what came may be a piece of another
+        motions, later = expand(judge, motions)
+        expanded += later
     say("settling labels and motions")
     motions, rounds = settle_labels(judge, motions, config)
     motions, joined = join_twins(states, motions, found.problem.scale.apart)
