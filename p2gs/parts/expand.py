@@ -16,7 +16,7 @@ import torch
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.refine_motions import Judge
-from p2gs.parts.label_cut import spread
+from p2gs.parts.label_cut import spread, with_all_static
 from p2gs.parts.part_choices import without_part
 
 
@@ -26,18 +26,15 @@ def expand(judge: Judge, motions: PartMotions) -> tuple[PartMotions, list[dict]]
     tell, surface stays still."""
     taken: list[dict] = []
     while len(motions):
-        best = None
+        best, told = None, {"energy": 0.0}
         for how, part, tried in expansions(judge, motions):
             gained = judge.gain(tried, motions)
-            if gained <= (0 if best is None else -best[0]["energy"]):
-                continue
-            own = judge.own_share(tried, motions)
-            if own >= judge.further:
-                best = {"change": how, "part": part, "own_share": own, "energy": -gained}, tried
+            if gained > -told["energy"] and (own := judge.own_share(tried, motions)) >= judge.further:
+                best, told = tried, {"change": how, "part": part, "own_share": own, "energy": -gained}
         if best is None:
             break
-        taken.append(best[0])
-        motions = best[1]
+        motions = best
+        taken.append(told)
     return motions, taken
 
 
@@ -45,8 +42,7 @@ def expansions(judge: Judge, motions: PartMotions) -> Iterator[tuple[str, int, P
     """For each part, (how, part, motions): with all static surface its own; of several, with that of the static surface
     and of another part that the cut gives it, where that is most of the other's, which goes; with everything."""
     for k in range(len(motions)):
-        labels = [torch.where(own == 0, k + 1, own) for own in motions.labels]
-        yield "took the static surface", k, replace(motions, labels=labels)
+        yield "took the static surface", k, with_all_static(motions, k)
         for other in range(len(motions)):
             if other != k:
                 left = k - (k > other)

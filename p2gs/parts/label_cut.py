@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.agreement import SOLID
 from p2gs.motion.refine_motions import Judge
 from p2gs.ops import se3
 from p2gs.ops.graph_cut import cut_of_edges
@@ -39,15 +40,18 @@ class Nodes:
     cannot: Tensor
 
 
+def with_all_static(motions: PartMotions, k: int) -> PartMotions:
+    """The motions with all static surface part ``k``'s."""
+    return replace(motions, labels=[torch.where(own == 0, k + 1, own) for own in motions.labels])
+
+
 def spread(judge: Judge, motions: PartMotions, k: int) -> PartMotions:
     """The motions with part ``k`` (0 is the first that moves) spread over the static surface, as far as the least cut
     has it; faint Gaussians go with the nearest solid one."""
-    taken = [torch.where(own == 0, k + 1, own) for own in motions.labels]
-    seen = judge.seen(replace(motions, labels=taken))
-    nodes = []
+    seen, nodes = judge.seen(with_all_static(motions, k)), []
     for state, own, of in zip(judge.states, motions.labels, seen, strict=True):
         g = state.gaussians
-        solid = torch.sigmoid(g.opacity_logits) > 0.5
+        solid = torch.sigmoid(g.opacity_logits) > SOLID
         rows = (solid & ((own == 0) | (own == k + 1))).nonzero().squeeze(1)
         colours = dc_to_rgb((of.lit if state.state == 0 else g).sh[:, 0]).clamp(0, 1)
         has = own[rows] == k + 1
@@ -71,17 +75,15 @@ def least_border(nodes: list[Nodes], T: Tensor, unlike: float, reach: float) -> 
     T [4, 4]: the part's motion, start -> end.  unlike: difference in colour, mean of channels, at which an edge costs
     nothing.  reach: distance within which something is where a motion leads, internal units.
     """
-    edges = [_edges(of, None, of, NEIGHBOURS, unlike, float("inf")) for of in nodes]
-    for way in (torch.eye(4, dtype=torch.float64), T.double()):
-        for s in (0, 1):
-            there = se3.apply(se3.inverse(way) if s else way, nodes[s].points.double()).float()
-            edges.append(_edges(nodes[s], there, nodes[1 - s], 1, unlike, reach))
     first, count = len(nodes[0].rows), sum(len(of.rows) for of in nodes)
-    start = [0, first, 0, first, 0, first]
-    end = [0, first, first, 0, first, 0]
-    tail = np.concatenate([e[0] + o for e, o in zip(edges, start, strict=True)])
-    head = np.concatenate([e[1] + o for e, o in zip(edges, end, strict=True)])
-    worth = np.concatenate([e[2] for e in edges])
+    edges = []  # of a state's nodes with those of a state, by their numbers there
+    for s, of in enumerate(nodes):
+        edges.append((s, s, *_edges(of, None, of, NEIGHBOURS, unlike, float("inf"))))
+        for there in (of.points, se3.apply(se3.inverse(T) if s else T, of.points.double()).float()):
+            edges.append((s, 1 - s, *_edges(of, there, nodes[1 - s], 1, unlike, reach)))
+    tail = np.concatenate([own + first * s for s, _, own, _, _ in edges])
+    head = np.concatenate([other + first * s for _, s, _, other, _ in edges])
+    worth = np.concatenate([of for *_, of in edges])
     has, cannot = (torch.cat([getattr(of, name) for of in nodes]).numpy() for name in ("has", "cannot"))
     sure = np.bincount(np.r_[tail, head], np.r_[worth, worth], count).astype(np.int64) + 1  # more than all its edges
     pull = np.where(has, sure, np.where(cannot, -sure, 0))

@@ -10,6 +10,7 @@ import torch
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.ops.graph_cut import cut_of_edges
+from p2gs.ops.sh import rgb_to_dc
 from p2gs.parts.expand import expansions
 from p2gs.parts.label_cut import Nodes, least_border, spread
 from p2gs.types import GaussianTensors
@@ -91,9 +92,9 @@ def judge_of_the_bottle() -> tuple[SimpleNamespace, PartMotions, list[torch.Tens
     states, labels, kept, true = [], [], [], []
     for (nodes, cap), state in zip(zip(*torn(), strict=True), (0, 1), strict=True):
         n = len(nodes.points)
-        dark = ((nodes.colours - 0.5) / 0.28209479177387814)[:, None]
+        sh = rgb_to_dc(nodes.colours)[:, None]
         g = GaussianTensors(
-            nodes.points, torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4), torch.zeros(n, 3), torch.full((n,), 4.0), dark
+            nodes.points, torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4), torch.zeros(n, 3), torch.full((n,), 4.0), sh
         )
         g.opacity_logits[::7] = -2.0  # faint ones go with the nearest solid one
         row = (nodes.points[:, 2] / STEP).round()
