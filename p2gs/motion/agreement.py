@@ -41,10 +41,11 @@ def kept_and_shown(
     """Of the Gaussians of ``state``, [N] bool each: which nothing contradicts in the other state, and which the other
     state shows.
 
-    Carried to the other state by its part's motion a Gaussian is shown there where most views see it on a surface of
-    the same part, of like colour and from the side that its own state shows. It is contradicted where they see through
-    it or its ends (it reaches over the edge of what it was labelled with), and where it lies on a surface that is not
-    like it. Inside and behind, where nobody looks, nothing is, nor on a thin plate's other side, which hides it.
+    Carried to the other state by its part's motion a Gaussian is shown there where most views see it on a surface that
+    came from the same place, of like colour and from the side that its own state shows. It is contradicted where they
+    see through it or its ends (it reaches over the edge of what it was labelled with), and where it lies on a surface
+    that is not like it. Inside and behind, where nobody looks, nothing is, nor on a thin plate's other side, which
+    hides it.
     lit: the state's Gaussians as the other's light has them (``as_lit_there``).  stacks: rendered depth of both states.
     """
     g, labels = states[state].gaussians, motions.labels[state]
@@ -56,7 +57,7 @@ def kept_and_shown(
     on[moving], through[moving] = met(stack, at[moving], config.free_moving)
     for end in ends(g[moving]):
         through[moving] |= met(stack, landed(end, labels[moving], T), config.free_static)[1]
-    like, part = alike(states, motions, state, at, dc_to_rgb(lit.sh[:, 0]).clamp(0, 1), config.other_colour)
+    like, part = alike(states, motions, state, at, dc_to_rgb(lit.sh[:, 0]).clamp(0, 1), config)
     own = (way[:, :3, :3] @ seen_from(g, stacks[state], config.free_static)[moving].to(way)[..., None])[..., 0]
     same_side = (own * stack.seen_from(at[moving], config.free_moving)).sum(1) > 0
     behind = torch.zeros_like(on)
@@ -93,10 +94,11 @@ def ends(g: GaussianTensors) -> list[Tensor]:
 
 
 def alike(
-    states: list[StateGaussians], motions: PartMotions, state: int, at: Tensor, colours: Tensor, other_colour: float
+    states: list[StateGaussians], motions: PartMotions, state: int, at: Tensor, colours: Tensor, config: PolishConfig
 ) -> tuple[Tensor, Tensor]:
-    """[N] bool each: is one of the other state's solid Gaussians next to ``at`` [N, 3] of the same part and of like
-    colour (``colours`` [N, 3] in 0..1, mean of channels), and of the same part at all?"""
+    """[N] bool each: has one of the other state's solid Gaussians next to ``at`` [N, 3] come from where these are (to
+    within ``config.free_moving``) and a like colour (``colours`` [N, 3] in 0..1, mean of channels), and has one come
+    from there at all?"""
     other = states[1 - state].gaussians
     solid = (torch.sigmoid(other.opacity_logits) > SOLID).nonzero().squeeze(1)
     if len(solid) < NEIGHBOURS:
@@ -105,8 +107,10 @@ def alike(
     near = solid[knn(other.means[solid].contiguous(), at.contiguous(), NEIGHBOURS)[1]]
     theirs = dc_to_rgb(other.sh[:, 0]).clamp(0, 1)
     apart = (theirs[near] - colours[:, None]).abs().mean(-1)
-    same = motions.labels[1 - state][near] == motions.labels[state][:, None]
-    return (same & (apart < other_colour)).any(1), same.any(1)
+    T = with_static(se3.inverse(motions.transforms) if state else motions.transforms).to(at)
+    places = se3.apply(T, states[state].gaussians.means)  # [K, N, 3]
+    same = ((places - at).norm(dim=2) < config.free_moving).T.gather(1, motions.labels[1 - state][near])
+    return (same & (apart < config.other_colour)).any(1), same.any(1)
 
 
 class ShownPixels:

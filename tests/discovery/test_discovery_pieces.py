@@ -19,7 +19,7 @@ from p2gs.motion.discovery.explanations import ranked, total_score
 from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.discovery.finish import Explanation
 from p2gs.motion.discovery.hypotheses import Sweep, static_axes
-from p2gs.motion.discovery.labels import REVEALED, Graph, Labelling, label, unary
+from p2gs.motion.discovery.labels import MET, OTHERWISE, REVEALED, Graph, Labelling, arrivals, label, unary, unlike
 from p2gs.motion.discovery.pipeline import discover
 from p2gs.motion.discovery.problem import build_problem, evidence_masks, resampled
 from p2gs.motion.discovery.proposals import as_motions, relabel
@@ -306,6 +306,39 @@ def test_pattern_search_climbs_to_the_top_of_a_known_gain():
     end, value = pattern_search(gain, start, 0.1, rounds=40, turn_radius=1.0)
     assert bool((value > before * 0.02).all()) and bool((value <= 0).all())
     torch.testing.assert_close(gain(end), value)
+
+
+def test_what_the_other_state_says_of_a_point_costs_where_it_says_otherwise(stacked):
+    """Against every pair, one by one."""
+    problem, _, _, truth = stacked
+    for state in (0, 1):
+        landed = arrivals(problem, truth, state)
+        theirs = torch.softmax(torch.randn(len(problem.surfels[1 - state]), len(truth) + 1), 1)
+        cost = unlike(problem, truth, state, landed, theirs)
+        places = truth.places(problem.surfels[state].points, state == 1)
+        for i in range(0, len(cost), 97):
+            slow = torch.zeros(len(truth) + 1)
+            for k in (k for k in range(len(truth)) if landed[0][k, i] < MET):
+                same = [float((p[i] - places[k + 1, i]).norm()) < problem.scale.tp for p in places]
+                came = sum(float(theirs[landed[1][k, i], of]) for of, alike in enumerate(same) if alike)
+                for of, alike in enumerate(same):
+                    slow[of] += OTHERWISE * (1 - came if of == k + 1 else 0.0 if alike else came)
+            torch.testing.assert_close(cost[i], slow, atol=1e-6, rtol=0)
+
+
+def test_parts_that_went_alike_answer_for_one_another(stacked):
+    """A motion given twice: whichever of the two each state calls its surface, nothing contradicts it that did not."""
+    problem, graphs, _, truth = stacked
+    right, dark = label(problem, truth, graphs), TurnedLight(torch.zeros(3, 4))
+    twice = Motions.cat([truth, truth[:1]])
+    mine = [(right.labels(s) == 1).nonzero()[:, 0] for s in (0, 1)]
+    for state in (0, 1):
+        other = torch.nn.functional.pad(right.probability[1 - state], (0, 1))
+        other[mine[1 - state]] = torch.eye(4)[3]
+        pair = [torch.nn.functional.pad(right.probability[state], (0, 1)), other]
+        told = Labelling(pair if state == 0 else pair[::-1], right.cost)
+        before = violation(problem, truth, right, state, mine[state], light=dark)
+        torch.testing.assert_close(violation(problem, twice, told, state, mine[state], light=dark), before)
 
 
 def test_what_has_another_colour_in_its_place_has_changed_and_may_have_been_behind():

@@ -61,6 +61,19 @@ def test_what_arrives_on_another_surface_or_in_the_air_has_no_say(why):
     assert not kept.any() and not shown.any()
 
 
+@pytest.mark.parametrize("other, agrees", [(0.5, True), (0.502, True), (0.7, False)])
+def test_two_parts_that_went_alike_agree_with_one_another(other, agrees):
+    """Two drawers: the end's surface is labelled the second's, which slid by ``other``, the start's the first's."""
+    T = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    T[:, 0, 3] = torch.tensor([0.5, other])
+    one = torch.ones(169, dtype=torch.long)
+    start, end = splats(grid(0.0)), splats(grid(0.5))
+    motions = PartMotions(["prismatic"] * 2, T, torch.ones(2), [one, 2 * one], [torch.ones(169)] * 2)
+    states, stacks = [StateGaussians(0, start), StateGaussians(1, end)], [facing(0.0), facing(0.5)]
+    kept, shown = kept_and_shown(states, motions, 0, start, stacks, CONFIG)
+    assert bool(kept.all()) == agrees and bool(shown.any()) == agrees
+
+
 @pytest.mark.parametrize("colour", [0.0, 1.5])
 def test_a_thin_plates_other_side_hides_and_contradicts_nothing(colour):
     one, there = torch.ones(169, dtype=torch.long), splats(grid(0.5), colour=colour)

@@ -17,6 +17,8 @@ from p2gs.native import native, num_threads
 
 # cost of staying, of what has another colour than was there before: less than hiding (0.35), as it may have been behind
 REVEALED = 0.3
+# landing cost below which a point takes the surfel it meets for itself, and what it costs if that one says otherwise
+MET, OTHERWISE = 0.25, 0.25
 
 
 class Graph:
@@ -138,17 +140,29 @@ class Labelling:
 
 
 def label(problem: Problem, motions: Motions, graphs: list[Graph], agree: int = 2, revealed: bool = False) -> Labelling:
-    """Label both states; after a first pass, points pay for landing on a surface that the other state labels
-    differently."""
+    """Label both states; after a first pass, what one state says of a point costs where the other says otherwise
+    (``unlike``)."""
     landed = [arrivals(problem, motions, s) for s in (0, 1)]
     costs = [unary(problem, motions, s, revealed, landed[s]) for s in (0, 1)]
     p = [smooth_labels(costs[s], graphs[s]) for s in (0, 1)]
     for _ in range(agree):
-        extra = []
-        for s in (0, 1):
-            add = torch.zeros_like(costs[s])
-            for k, (c, j) in enumerate(zip(*landed[s], strict=True)):
-                add[:, k + 1] = torch.where(c < 0.25, 0.25 * (1 - p[1 - s][j, k + 1]), torch.zeros(()))
-            extra.append(add)
+        extra = [unlike(problem, motions, s, landed[s], p[1 - s]) for s in (0, 1)]
         p = [smooth_labels(costs[s] + extra[s], graphs[s]) for s in (0, 1)]
     return Labelling(p, costs)
+
+
+def unlike(problem: Problem, motions: Motions, state: int, landed: tuple[Tensor, Tensor], theirs: Tensor) -> Tensor:
+    """Cost [N, K + 1] of labels of ``state`` by probabilities ``theirs`` [M, K + 1] of the other's. A point and the
+    surfel that it meets there are one (Potts across the states): under the motion by which they meet it pays as far as
+    that surfel came from elsewhere, under one that takes it elsewhere as far as that surfel came from here."""
+    places = motions.places(problem.surfels[state].points, state == 1)
+    out = torch.zeros(places.shape[1], len(places))
+    for k, (cost, met) in enumerate(zip(*landed, strict=True)):
+        rows = (cost < MET).nonzero()[:, 0]
+        here = places[:, rows]
+        same = ((here - here[k + 1]).norm(dim=2) < problem.scale.tp).T
+        came = (theirs[met[rows]] * same).sum(1, keepdim=True)
+        price = torch.where(same, 0.0, came)
+        price[:, k + 1] = 1 - came[:, 0]
+        out[rows] += OTHERWISE * price
+    return out

@@ -102,6 +102,10 @@ class Motions:
         p = points.expand(len(self), *points.shape[-2:])
         return (p - t[:, None]) @ R if inverse else p @ R.transpose(1, 2) + t[:, None]
 
+    def places(self, points: Tensor, inverse: bool = False) -> Tensor:
+        """points [P, 3] -> [B + 1, P, 3]: where they are, and where each motion takes them."""
+        return torch.cat([points[None], self.apply(points, inverse)])
+
     def rotate(self, normals: Tensor, inverse: bool = False) -> Tensor:
         """Directions [P, 3] or [B, P, 3] -> [B, P, 3]."""
         R = self.matrices()[0]

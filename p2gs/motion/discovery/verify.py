@@ -14,7 +14,7 @@ from p2gs.motion.discovery.rigid import Motions
 from p2gs.motion.light import TurnedLight, turned_light
 
 WRONG = 1.0  # cost of a point that something contradicts; hidden space costs what it does where motions are searched
-NEIGHBOURS = 6  # surfels of the other state, one of which must be of the same part where a point lands on a surface
+NEIGHBOURS = 6  # surfels of the other state where a point lands, one of which must have come from the same place
 # weight of a point that is said to move but is not known to: its error is the neighbour's rather than the motion's
 STILL = 0.3
 
@@ -39,27 +39,26 @@ def violation(
     light: TurnedLight | None = None,
 ) -> Tensor:
     """Cost [M] in 0..1 of the labelled surfels ``index`` [M] of ``state``: the share of the other state's views that
-    see through where a point is predicted, of those not blocked by something in front; where they see a surface that is
-    of another part or another colour, as wrong as empty space (of a plate's other side, ``motions.thick`` away, colours
-    tell nothing); where all are blocked ``Landing.HIDDEN``, or by the plate's other side ``Landing.TWO_SIDED``. A moved
-    point that is called static is wrong. light: of ``light_of``, if it is known."""
+    see through where a point is predicted, of those not blocked by something in front; where they see a surface that
+    came from elsewhere or has another colour, as wrong as empty space (of a plate's other side, ``motions.thick`` away,
+    colours tell nothing); where all are blocked ``Landing.HIDDEN``, or by the plate's other side ``Landing.TWO_SIDED``.
+    A moved point that is called static is wrong. light: of ``light_of``, if it is known."""
     light = light_of(problem, motions, labelling) if light is None else light
     surf, stack, other = problem.surfels[state], problem.stacks[1 - state], problem.surfels[1 - state]
     labels = labelling.labels(state)[index]
-    x, n, thick = surf.points[index].clone(), surf.normals[index].clone(), torch.zeros(len(index))
-    colours = surf.colours[index].clone()
+    places = motions.places(surf.points[index], state == 1)
+    x, colours = places[labels, torch.arange(len(index))], surf.colours[index].clone()
+    n, thick = surf.normals[index].clone(), torch.zeros(len(index))
     for k in range(len(motions)):
         mine, motion = labels == k + 1, motions[k : k + 1]
-        x[mine], n[mine] = motion.apply(x[mine], inverse=state == 1)[0], motion.rotate(n[mine], inverse=state == 1)[0]
-        thick[mine] = motion.thick
+        n[mine], thick[mine] = motion.rotate(n[mine], inverse=state == 1)[0], motion.thick
     gains = light.gains(labels, n if state else surf.normals[index])
     colours *= (1 / gains if state else gains)[:, None]
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(views))
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
     d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
-    own = (labelling.labels(1 - state)[j] == labels[:, None]) & (
-        d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None]
-    )
+    same = ((places - x).norm(dim=2) < problem.scale.tp).T.gather(1, labelling.labels(1 - state)[j])
+    own = same & (d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None])
     other_side = own & ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
     coloured = (other.colours[j] - colours[:, None]).abs().mean(2) < problem.config.recoloured
     like = other_side | (own & coloured)
