@@ -29,6 +29,7 @@ from p2gs.gaussians import handover
 from p2gs.metrics.joints import joint_errors, match_joints
 from p2gs.metrics.modules import JointError
 from p2gs.models.part_discovery import find_part_motions
+from p2gs.models.registered import correct_scene, register_state, register_views
 from p2gs.ops import se3
 from p2gs.runtime.pipeline import Pipeline
 
@@ -98,7 +99,7 @@ def paired(found: list, truth: list, right: np.ndarray) -> dict[int, int]:
 
 
 class Case:
-    """A run, its states and its truth."""
+    """A run, its states as discovery had them (registered) and its truth."""
 
     def __init__(self, run: Path, zoo: Path, preset: str = "configs/preset/cpu.yaml"):
         self.name = run.name
@@ -106,7 +107,10 @@ class Case:
         self.pipeline = Pipeline(
             load_config([preset], ["--data.root", root, "--data.depth", "never", "--run", str(run)])
         )
-        self.states = [handover.load(run / "checkpoints" / f"single_state_{s}.pt")[0] for s in (0, 1)]
+        states = [handover.load(run / "checkpoints" / f"single_state_{s}.pt")[0] for s in (0, 1)]
+        registration = handover.load(run / "checkpoints" / "registration.pt")[0]
+        self.pipeline.context.take(register_views(correct_scene(self.pipeline.scene, states), registration))
+        self.states = [register_state(s, registration) for s in states]
         self.scene, self.cfg = self.pipeline.scene, self.pipeline.cfg
         self.truth = load_ground_truth(self.cfg.data.root)
         names = next(

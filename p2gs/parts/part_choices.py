@@ -20,8 +20,8 @@ def simplify(
     judge: Judge, motions: PartMotions, same_motion: float, log: list[dict] | None = None, final: bool = False
 ) -> PartMotions:
     """Make one of touching parts that ``same_motion`` (internal units) does not tell apart, and drop parts, while the
-    energy does not rise; drop a part, too, that has an axis of its own and saves less of the image loss in its own
-    pixels (``Judge.own_share``) than a further one must (``judge.further``).
+    energy does not rise; drop one of several, too, that has an axis of its own and saves less of the image loss in its
+    own pixels (``Judge.own_share``) than a further one must (``judge.further``).
 
     log: told of each part that goes: what was done, its index then, the label that its Gaussians got (numbered as
     then), its type, the share of the image loss that it saved in its own pixels, the change of the energy.  final:
@@ -40,7 +40,7 @@ def simplify(
             if not final and judge.gain(reduced, motions) >= 0:
                 break
             alone = has_own_axis(states, motions, part) if final else lonely(states, motions, reduced, part)
-            asked = alone or (final and motions.types[part] == "revolute")
+            asked = len(motions) > 1 and (alone or (final and motions.types[part] == "revolute"))
             if done != "merge" and asked and judge.own_share(motions, reduced) < (judge.further if alone else 0.0):
                 break
         else:

@@ -308,7 +308,7 @@ def test_pattern_search_climbs_to_the_top_of_a_known_gain():
     torch.testing.assert_close(gain(end), value)
 
 
-def test_what_the_other_state_says_of_a_point_costs_where_it_says_otherwise(stacked):
+def test_a_point_pays_where_the_other_state_says_that_what_it_meets_came_from_elsewhere(stacked):
     """Against every pair, one by one."""
     problem, _, _, truth = stacked
     for state in (0, 1):
@@ -319,10 +319,9 @@ def test_what_the_other_state_says_of_a_point_costs_where_it_says_otherwise(stac
         for i in range(0, len(cost), 97):
             slow = torch.zeros(len(truth) + 1)
             for k in (k for k in range(len(truth)) if landed[0][k, i] < MET):
-                same = [float((p[i] - places[k + 1, i]).norm()) < problem.scale.tp for p in places]
-                came = sum(float(theirs[landed[1][k, i], of]) for of, alike in enumerate(same) if alike)
-                for of, alike in enumerate(same):
-                    slow[of] += OTHERWISE * (1 - came if of == k + 1 else 0.0 if alike else came)
+                came = [float((p[i] - places[k + 1, i]).norm()) < problem.scale.tp for p in places]
+                other = [float(p) for p, here in zip(theirs[landed[1][k, i]], came, strict=True) if not here]
+                slow[k + 1] = OTHERWISE * sum(other)
             torch.testing.assert_close(cost[i], slow, atol=1e-6, rtol=0)
 
 

@@ -16,7 +16,7 @@ from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
 from p2gs.parts import settle
-from p2gs.parts.part_choices import lonely
+from p2gs.parts.part_choices import lonely, simplify, without_part
 from p2gs.parts.seek import seek
 
 COARSE = PolishConfig(steps=60, levels=[64], level_starts=[0.0], rate=5e-3, min_margin=0.0, free_static=0.0, front=-1.0)
@@ -189,6 +189,23 @@ def test_what_is_sought_must_save_its_share_once_refined(monkeypatch):
         if parts == 2:
             assert float((motions.transforms[1] - slide()).norm()) < 0.01
     assert len(seek(judge_of(states, views), first, 1, PartMotionsConfig())[0]) == 1  # no more parts than allowed
+
+
+def test_an_only_part_that_energy_asks_for_need_not_save_its_share(monkeypatch):
+    """Its motion may be far off yet, and nothing can be exchanged where nothing is left. A further part must."""
+    states, labels, views = two_states(slide())
+    margins = [torch.ones(len(labels))] * 2
+    off = torch.eye(4).double()
+    off[:3, 3] = torch.tensor([0.1, 0.4, 0.3])
+    monkeypatch.setattr("p2gs.motion.refine_motions.surface_energy", lambda found, T, types: -9.0 * len(types))
+    judge = replace(judge_of(states, views), further=0.9)
+    only = PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], margins)
+    assert judge.own_share(only, without_part(only, 0, 0)) < 0.9
+    assert simplify(judge, only, 0.0) is only
+    T = torch.stack([off, se3.from_screw(torch.tensor([0.0, 1, 0]).double(), torch.zeros(3).double(), 0.8)])
+    two = PartMotions(["prismatic", "revolute"], T, torch.ones(2), [2 * labels, 2 * labels], margins)
+    log: list[dict] = []
+    assert len(simplify(judge, two, 0.0, log)) == 1 and len(log) == 1
 
 
 def test_two_bodies_with_amounts_of_their_own_are_taken_where_the_energy_falls(monkeypatch):

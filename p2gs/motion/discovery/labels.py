@@ -140,8 +140,8 @@ class Labelling:
 
 
 def label(problem: Problem, motions: Motions, graphs: list[Graph], agree: int = 2, revealed: bool = False) -> Labelling:
-    """Label both states; after a first pass, what one state says of a point costs where the other says otherwise
-    (``unlike``)."""
+    """Label both states; after a first pass, points pay for landing on a surface that came from elsewhere by the other
+    state's labels (``unlike``)."""
     landed = [arrivals(problem, motions, s) for s in (0, 1)]
     costs = [unary(problem, motions, s, revealed, landed[s]) for s in (0, 1)]
     p = [smooth_labels(costs[s], graphs[s]) for s in (0, 1)]
@@ -152,17 +152,11 @@ def label(problem: Problem, motions: Motions, graphs: list[Graph], agree: int = 
 
 
 def unlike(problem: Problem, motions: Motions, state: int, landed: tuple[Tensor, Tensor], theirs: Tensor) -> Tensor:
-    """Cost [N, K + 1] of labels of ``state`` by probabilities ``theirs`` [M, K + 1] of the other's. A point and the
-    surfel that it meets there are one (Potts across the states): under the motion by which they meet it pays as far as
-    that surfel came from elsewhere, under one that takes it elsewhere as far as that surfel came from here."""
+    """Cost [N, K + 1] of labels of ``state`` by probabilities ``theirs`` [M, K + 1] of the other's: under a motion by
+    which a point meets a surfel there it pays as far as that surfel came from elsewhere."""
     places = motions.places(problem.surfels[state].points, state == 1)
     out = torch.zeros(places.shape[1], len(places))
     for k, (cost, met) in enumerate(zip(*landed, strict=True)):
-        rows = (cost < MET).nonzero()[:, 0]
-        here = places[:, rows]
-        same = ((here - here[k + 1]).norm(dim=2) < problem.scale.tp).T
-        came = (theirs[met[rows]] * same).sum(1, keepdim=True)
-        price = torch.where(same, 0.0, came)
-        price[:, k + 1] = 1 - came[:, 0]
-        out[rows] += OTHERWISE * price
+        same = ((places - places[k + 1]).norm(dim=2) < problem.scale.tp).T
+        out[:, k + 1] = torch.where(cost < MET, OTHERWISE * (1 - (theirs[met] * same).sum(1)), 0.0)
     return out
