@@ -319,7 +319,7 @@ def test_a_point_pays_where_the_other_state_says_that_what_it_meets_came_from_el
         for i in range(0, len(cost), 97):
             slow = torch.zeros(len(truth) + 1)
             for k in (k for k in range(len(truth)) if landed[0][k, i] < MET):
-                came = [float((p[i] - places[k + 1, i]).norm()) < problem.scale.tp for p in places]
+                came = [float((p[i] - places[k + 1, i]).norm()) < problem.scale.apart for p in places]
                 other = [float(p) for p, here in zip(theirs[landed[1][k, i]], came, strict=True) if not here]
                 slow[k + 1] = OTHERWISE * sum(other)
             torch.testing.assert_close(cost[i], slow, atol=1e-6, rtol=0)

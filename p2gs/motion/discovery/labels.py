@@ -157,6 +157,6 @@ def unlike(problem: Problem, motions: Motions, state: int, landed: tuple[Tensor,
     places = motions.places(problem.surfels[state].points, state == 1)
     out = torch.zeros(places.shape[1], len(places))
     for k, (cost, met) in enumerate(zip(*landed, strict=True)):
-        same = ((places - places[k + 1]).norm(dim=2) < problem.scale.tp).T
+        same = ((places - places[k + 1]).norm(dim=2) < problem.scale.apart).T
         out[:, k + 1] = torch.where(cost < MET, OTHERWISE * (1 - (theirs[met] * same).sum(1)), 0.0)
     return out

@@ -57,7 +57,7 @@ def violation(
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(views))
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
     d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
-    same = ((places - x).norm(dim=2) < problem.scale.tp).T.gather(1, labelling.labels(1 - state)[j])
+    same = ((places - x).norm(dim=2) < problem.scale.apart).T.gather(1, labelling.labels(1 - state)[j])
     own = same & (d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None])
     other_side = own & ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
     coloured = (other.colours[j] - colours[:, None]).abs().mean(2) < problem.config.recoloured
