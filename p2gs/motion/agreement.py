@@ -96,9 +96,9 @@ def ends(g: GaussianTensors) -> list[Tensor]:
 def alike(
     states: list[StateGaussians], motions: PartMotions, state: int, at: Tensor, colours: Tensor, config: PolishConfig
 ) -> tuple[Tensor, Tensor]:
-    """[N] bool each: has one of the other state's solid Gaussians next to ``at`` [N, 3] come from where these are (to
-    within ``config.free_moving``) and a like colour (``colours`` [N, 3] in 0..1, mean of channels), and has one come
-    from there at all?"""
+    """[N] bool each, of the other state's solid Gaussians next to ``at`` [N, 3]: whether one came from where these are
+    (to within ``config.free_moving``) and is of like colour (``colours`` [N, 3] in 0..1, mean of channels); whether one
+    came from there at all."""
     other = states[1 - state].gaussians
     solid = (torch.sigmoid(other.opacity_logits) > SOLID).nonzero().squeeze(1)
     if len(solid) < NEIGHBOURS:

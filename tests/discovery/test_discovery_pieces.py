@@ -19,7 +19,7 @@ from p2gs.motion.discovery.explanations import ranked, total_score
 from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.discovery.finish import Explanation
 from p2gs.motion.discovery.hypotheses import Sweep, static_axes
-from p2gs.motion.discovery.labels import MET, OTHERWISE, REVEALED, Graph, Labelling, arrivals, label, unary, unlike
+from p2gs.motion.discovery.labels import ELSEWHERE, REVEALED, Graph, Labelling, arrivals, label, unary, unlike
 from p2gs.motion.discovery.pipeline import discover
 from p2gs.motion.discovery.problem import build_problem, evidence_masks, resampled
 from p2gs.motion.discovery.proposals import as_motions, relabel
@@ -318,10 +318,10 @@ def test_a_point_pays_where_the_other_state_says_that_what_it_meets_came_from_el
         places = truth.places(problem.surfels[state].points, state == 1)
         for i in range(0, len(cost), 97):
             slow = torch.zeros(len(truth) + 1)
-            for k in (k for k in range(len(truth)) if landed[0][k, i] < MET):
+            for k in (k for k in range(len(truth)) if landed[0][k, i] < ELSEWHERE):
                 came = [float((p[i] - places[k + 1, i]).norm()) < problem.scale.apart for p in places]
                 other = [float(p) for p, here in zip(theirs[landed[1][k, i]], came, strict=True) if not here]
-                slow[k + 1] = OTHERWISE * sum(other)
+                slow[k + 1] = ELSEWHERE * sum(other)
             torch.testing.assert_close(cost[i], slow, atol=1e-6, rtol=0)
 
 

@@ -17,8 +17,8 @@ from p2gs.native import native, num_threads
 
 # cost of staying, of what has another colour than was there before: less than hiding (0.35), as it may have been behind
 REVEALED = 0.3
-# landing cost below which a point takes the surfel it meets for itself, and what it costs if that one says otherwise
-MET, OTHERWISE = 0.25, 0.25
+# cost of meeting a surfel that came from elsewhere; what lands for more than this met none
+ELSEWHERE = 0.25
 
 
 class Graph:
@@ -158,5 +158,5 @@ def unlike(problem: Problem, motions: Motions, state: int, landed: tuple[Tensor,
     out = torch.zeros(places.shape[1], len(places))
     for k, (cost, met) in enumerate(zip(*landed, strict=True)):
         same = ((places - places[k + 1]).norm(dim=2) < problem.scale.apart).T
-        out[:, k + 1] = torch.where(cost < MET, OTHERWISE * (1 - (theirs[met] * same).sum(1)), 0.0)
+        out[:, k + 1] = torch.where(cost < ELSEWHERE, ELSEWHERE * (1 - (theirs[met] * same).sum(1)), 0.0)
     return out
