@@ -14,6 +14,7 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.gaussians.pose import with_static
+from p2gs.motion.discovery.rigid import same_place
 from p2gs.motion.light import seen_from
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3, so3
@@ -109,7 +110,7 @@ def alike(
     apart = (theirs[near] - colours[:, None]).abs().mean(-1)
     T = with_static(se3.inverse(motions.transforms) if state else motions.transforms).to(at)
     places = se3.apply(T, states[state].gaussians.means)  # [K, N, 3]
-    same = ((places - at).norm(dim=2) < config.free_moving).T.gather(1, motions.labels[1 - state][near])
+    same = same_place(places, at, config.free_moving).gather(1, motions.labels[1 - state][near])
     return (same & (apart < config.other_colour)).any(1), same.any(1)
 
 

@@ -24,7 +24,7 @@ from p2gs.motion.discovery.pipeline import discover
 from p2gs.motion.discovery.problem import build_problem, evidence_masks, resampled
 from p2gs.motion.discovery.proposals import as_motions, relabel
 from p2gs.motion.discovery.refine import pattern_search
-from p2gs.motion.discovery.rigid import Motions, axes_used
+from p2gs.motion.discovery.rigid import Motions, axes_used, same_place
 from p2gs.motion.discovery.rows import rows
 from p2gs.motion.discovery.search import Search
 from p2gs.motion.discovery.verify import light_of, violation
@@ -314,8 +314,8 @@ def test_a_point_pays_where_the_other_state_says_that_what_it_meets_came_from_el
     for state in (0, 1):
         landed = arrivals(problem, truth, state)
         theirs = torch.softmax(torch.randn(len(problem.surfels[1 - state]), len(truth) + 1), 1)
-        cost = unlike(problem, truth, state, landed, theirs)
         places = truth.places(problem.surfels[state].points, state == 1)
+        cost = unlike(landed, [same_place(places, at, problem.scale.apart) for at in places[1:]], theirs)
         for i in range(0, len(cost), 97):
             slow = torch.zeros(len(truth) + 1)
             for k in (k for k in range(len(truth)) if landed[0][k, i] < ELSEWHERE):

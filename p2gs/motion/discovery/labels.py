@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from p2gs.motion.discovery.problem import Problem
-from p2gs.motion.discovery.rigid import Motions
+from p2gs.motion.discovery.rigid import Motions, same_place
 from p2gs.native import native, num_threads
 
 # cost of staying, of what has another colour than was there before: less than hiding (0.35), as it may have been behind
@@ -145,18 +145,22 @@ def label(problem: Problem, motions: Motions, graphs: list[Graph], agree: int = 
     landed = [arrivals(problem, motions, s) for s in (0, 1)]
     costs = [unary(problem, motions, s, revealed, landed[s]) for s in (0, 1)]
     p = [smooth_labels(costs[s], graphs[s]) for s in (0, 1)]
+    places = [motions.places(problem.surfels[s].points, s == 1) for s in (0, 1)]
+    same = [[same_place(of, at, problem.scale.apart) for at in of[1:]] for of in places]
     for _ in range(agree):
-        extra = [unlike(problem, motions, s, landed[s], p[1 - s]) for s in (0, 1)]
+        extra = [unlike(landed[s], same[s], p[1 - s]) for s in (0, 1)]
         p = [smooth_labels(costs[s] + extra[s], graphs[s]) for s in (0, 1)]
     return Labelling(p, costs)
 
 
-def unlike(problem: Problem, motions: Motions, state: int, landed: tuple[Tensor, Tensor], theirs: Tensor) -> Tensor:
-    """Cost [N, K + 1] of labels of ``state`` by probabilities ``theirs`` [M, K + 1] of the other's: under a motion by
-    which a point meets a surfel there it pays as far as that surfel came from elsewhere."""
-    places = motions.places(problem.surfels[state].points, state == 1)
-    out = torch.zeros(places.shape[1], len(places))
+def unlike(landed: tuple[Tensor, Tensor], same: list[Tensor], theirs: Tensor) -> Tensor:
+    """Cost [N, K + 1] of a state's labels by probabilities ``theirs`` [M, K + 1] of the other's: under a motion by
+    which a point meets a surfel there it pays as far as that surfel came from elsewhere.
+
+    landed: ``arrivals``.  same: of each motion, [N, K + 1] bool, which labels bring a point where it does.
+    """
+    out = torch.zeros(landed[0].shape[1], theirs.shape[1])
     for k, (cost, met) in enumerate(zip(*landed, strict=True)):
-        same = ((places - places[k + 1]).norm(dim=2) < problem.scale.apart).T
-        out[:, k + 1] = torch.where(cost < ELSEWHERE, ELSEWHERE * (1 - (theirs[met] * same).sum(1)), 0.0)
+        came = (theirs[met] * same[k]).sum(1)
+        out[:, k + 1] = torch.where(cost < ELSEWHERE, ELSEWHERE * (1 - came), 0.0)
     return out

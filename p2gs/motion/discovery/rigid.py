@@ -29,6 +29,11 @@ def perpendicular(axis: Tensor) -> tuple[Tensor, Tensor]:
 ONE_WAY = 1 - 1e-6  # cosine of what rounding does to one direction: slides that were fitted one by one differ by more
 
 
+def same_place(places: Tensor, at: Tensor, within: float) -> Tensor:
+    """[P, K] bool: which of ``places`` [K, P, 3] of each point lie within ``within`` of ``at`` [P, 3]."""
+    return ((places - at).norm(dim=2) < within).T
+
+
 @dataclass
 class Motions:
     """B motions start -> end. turn [B] bool (revolute); axis [B, 3] unit; centre [B, 3] a point on the axis (unused by

@@ -10,7 +10,7 @@ from torch import Tensor
 from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.discovery.labels import Labelling
 from p2gs.motion.discovery.problem import Problem
-from p2gs.motion.discovery.rigid import Motions
+from p2gs.motion.discovery.rigid import Motions, same_place
 from p2gs.motion.light import TurnedLight, turned_light
 
 WRONG = 1.0  # cost of a point that something contradicts; hidden space costs what it does where motions are searched
@@ -57,7 +57,7 @@ def violation(
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(views))
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
     d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
-    same = ((places - x).norm(dim=2) < problem.scale.apart).T.gather(1, labelling.labels(1 - state)[j])
+    same = same_place(places, x, problem.scale.apart).gather(1, labelling.labels(1 - state)[j])
     own = same & (d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None])
     other_side = own & ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
     coloured = (other.colours[j] - colours[:, None]).abs().mean(2) < problem.config.recoloured
