@@ -15,6 +15,7 @@ from p2gs.motion.discovery.hypotheses import shared_directions
 from p2gs.motion.discovery.rigid import one_way, perpendicular
 from p2gs.ops import se3, so3
 from p2gs.ops.knn import knn
+from p2gs.ops.least_squares import least_squares
 from p2gs.ops.robust import MEDIAN_SIGMA
 
 WITHIN = 15.0  # degrees within which a direction is one that is known, or an axis is meant to lie along it
@@ -126,7 +127,7 @@ def _tilt(across: Tensor, offset: Tensor, rounds: int = 5) -> tuple[Tensor, Tens
     A = b = torch.zeros(0)
     for _ in range(rounds):
         A, b = (x * weight[:, None]).T @ x, (x * weight[:, None]).T @ y
-        residual = y - x @ torch.linalg.lstsq(A, b[:, None]).solution[:, 0]
+        residual = y - x @ least_squares(A, b)
         spread = MEDIAN_SIGMA * float(residual.abs().median()) + 1e-9
         weight = 1 / (1 + (residual / (2 * spread)).square()).square()
         A, b = A / spread**2, b / spread**2

@@ -17,6 +17,7 @@ from p2gs.gaussians.draw import render_gaussians
 from p2gs.motion.on_grey import drawing, photograph
 from p2gs.motion.picture_steps import TWIST, picture_steps
 from p2gs.ops import se3
+from p2gs.ops.least_squares import least_squares
 from p2gs.ops.ssim import l1_ssim
 from p2gs.types import Camera, GaussianTensors, RenderOutput
 
@@ -77,7 +78,7 @@ def fit_photographs(
                 normal, right = picture_steps(side.gaussians, replace(shot, camera=seen), backend).total()
                 A += by_motion.T @ normal[TWIST, TWIST] @ by_motion
                 b += right[TWIST] @ by_motion
-        step = torch.linalg.lstsq(A, b[:, None]).solution[:, 0]
+        step = least_squares(A, b)
         transform = se3.exp(step) @ transform
         if float(step.norm()) < SETTLED:
             break
