@@ -135,9 +135,15 @@ class GaussianTensors:
     sh: Tensor
 
     NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    SOLID = 0.5  # opacity above which a Gaussian is surface
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    @property
+    def solid(self) -> Tensor:
+        """[N] bool: which are surface, more opaque than ``SOLID``."""
+        return torch.sigmoid(self.opacity_logits) > self.SOLID
 
     def placed(self, means: Tensor, quats: Tensor) -> "GaussianTensors":
         """The same Gaussians elsewhere: other centres [N, 3] and orientations [N, 4]."""

@@ -218,7 +218,7 @@ def labelling(state: StateGaussians, record: FinishRecord, s: int, min_margin: f
     """Gaussians by part, the share of the solid ones whose label is too unclear for the polish, and of those that
     ``other``, the other state's rendered depth, says have moved (how many, and the share that is called static all the
     same)."""
-    solid = torch.sigmoid(state.gaussians.opacity_logits) > 0.5
+    solid = state.gaussians.solid
     labels, margin = record.labels[s][solid], record.margin[s][solid]
     count = torch.bincount(labels, minlength=len(record.after) + 1).tolist()
     unclear = margin < min_margin

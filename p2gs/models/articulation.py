@@ -86,7 +86,7 @@ class ArticulationPhase(ImagePhase):
     ):
         super().__init__(config, losses, views, **common)
         generator = self.generator(0, 3)
-        self.states = [s.gaussians.means[torch.sigmoid(s.gaussians.opacity_logits) > 0.5] for s in states]
+        self.states = [s.gaussians.means[s.gaussians.solid] for s in states]
         self.extent = extent
         check_losses(config, losses, canonical)
         labels = canonical.labels

@@ -41,7 +41,7 @@ def clean_labels(g: GaussianTensors, labels: Tensor, parts: int, k: int) -> Tens
 
 def surviving_slots(learned: Articulation, labels: Tensor, min_mass: float, min_motion: float) -> list[int]:
     """Movable slots with mass and motion (``FinishConfig``), as slot numbers; labels [N]."""
-    solid = torch.sigmoid(learned.gaussians.opacity_logits) > 0.5
+    solid = learned.gaussians.solid
     alive = []
     for k in range(1, len(learned.types) + 1):
         rows = solid & (labels == k)

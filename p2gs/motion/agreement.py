@@ -24,7 +24,6 @@ from p2gs.types import Camera, GaussianTensors
 from p2gs.visibility.depth_stack import DepthStack, classify
 from p2gs.visibility.free_space import landed
 
-SOLID = 0.5  # opacity from which on a Gaussian is surface
 EXTENT = 3.0  # standard deviations at which a Gaussian ends for the eye
 # what ``unmoved`` found last: Gaussians, tolerance, result
 _UNMOVED: WeakKeyDictionary[DepthStack, tuple] = WeakKeyDictionary()
@@ -101,7 +100,7 @@ def alike(
     (to within ``config.free_moving``) and is of like colour (``colours`` [N, 3] in 0..1, mean of channels); whether one
     came from there at all."""
     other = states[1 - state].gaussians
-    solid = (torch.sigmoid(other.opacity_logits) > SOLID).nonzero().squeeze(1)
+    solid = other.solid.nonzero().squeeze(1)
     if len(solid) < NEIGHBOURS:
         none = torch.zeros(len(at), dtype=torch.bool)
         return none, none

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.motion.agreement import SOLID
 from p2gs.motion.discovery.hypotheses import shared_directions
 from p2gs.motion.discovery.rigid import one_way, perpendicular
 from p2gs.ops import se3, so3
@@ -44,7 +43,7 @@ def _faced(states: list[StateGaussians], chosen: list[Tensor]) -> Tensor:
     points, normals = [], []
     for state, of in zip(states, chosen, strict=True):
         g = state.gaussians.detach()
-        still = of & (torch.sigmoid(g.opacity_logits).cpu() > SOLID)
+        still = of & g.solid.cpu()
         R = so3.quat_to_matrix(so3.quat_normalize(g.quats.cpu()[still]))
         shortest = g.log_scales.cpu()[still].argmin(1)
         normals.append(R.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0])

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
-from p2gs.motion.agreement import SOLID
 from p2gs.motion.refine_motions import Judge
 from p2gs.ops import se3
 from p2gs.ops.graph_cut import cut_of_edges
@@ -51,8 +50,7 @@ def spread(judge: Judge, motions: PartMotions, k: int) -> PartMotions:
     seen, nodes = judge.seen(with_all_static(motions, k)), []
     for state, own, of in zip(judge.states, motions.labels, seen, strict=True):
         g = state.gaussians
-        solid = torch.sigmoid(g.opacity_logits) > SOLID
-        rows = (solid & ((own == 0) | (own == k + 1))).nonzero().squeeze(1)
+        rows = (g.solid & ((own == 0) | (own == k + 1))).nonzero().squeeze(1)
         colours = dc_to_rgb((of.lit if state.state == 0 else g).sh[:, 0]).clamp(0, 1)
         has = own[rows] == k + 1
         nodes.append(Nodes(rows, g.means[rows], colours[rows], has, ~has & ~of.kept[rows]))

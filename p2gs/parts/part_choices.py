@@ -117,7 +117,7 @@ def join_twins(states, motions: PartMotions, reach: float) -> tuple[PartMotions,
 def _reductions(states, motions: PartMotions, same_motion: float, joins: bool = False):
     """Explanations with one part less: ((what is done, part, label that its Gaussians get), motions). Merging comes
     first, small parts go before large ones; with ``joins`` also into each larger part that they touch."""
-    solid = [torch.sigmoid(s.gaussians.opacity_logits) > 0.5 for s in states]
+    solid = [s.gaussians.solid for s in states]
     points = [
         [
             s.gaussians.means[of & (lab == k + 1)].double()
