@@ -9,7 +9,8 @@ from dataclasses import replace
 from typing import Callable, Protocol
 
 from p2gs.bench.cell import Outcome, stop_all
-from p2gs.bench.plan import BenchOptions, Cell
+from p2gs.bench.options import BenchOptions
+from p2gs.bench.plan import Cell
 
 Work = Callable[[Cell], Outcome]
 

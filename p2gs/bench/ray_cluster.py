@@ -6,7 +6,8 @@ import logging
 from dataclasses import replace
 
 from p2gs.bench.cell import Outcome
-from p2gs.bench.plan import BenchOptions, Cell
+from p2gs.bench.options import BenchOptions
+from p2gs.bench.plan import Cell
 from p2gs.types import UserError
 
 

@@ -97,7 +97,7 @@ def test_a_config_that_would_run_something_is_refused(tmp_path):
 
 
 def test_an_option_that_holds_anything_makes_no_object(tmp_path):
-    from p2gs.bench.plan import BenchOptions
+    from p2gs.bench.options import BenchOptions
     from p2gs.config.schema import Given
 
     proof = tmp_path / "ran"
