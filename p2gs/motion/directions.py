@@ -155,7 +155,8 @@ def shared_axes(transforms: Tensor, types: list[str]) -> Tensor:
 def hinged_directions(motions: PartMotions, faced: Tensor | None = None) -> Tensor:
     """[D, 3] (float64) what two hinges' axes agree on to ``KNOWN`` degrees, the mean of each such pair, and the axis of
     each hinge that lies so near to a direction ``faced`` [F, 3] of surfaces: measured by motion, where few points tell
-    which way a top or a front faces. Hinges on one line are one that was found twice."""
+    which way a top or a front faces. Hinges on one line are one that was found twice, unless they turn by other angles
+    (to ``WITHIN``)."""
     found = [se3.screw_parameters(T.double()) for T, kind in zip(motions.transforms, motions.types, strict=True)
              if kind == "revolute"]  # fmt: skip
     least = math.cos(math.radians(KNOWN))
@@ -163,7 +164,8 @@ def hinged_directions(motions: PartMotions, faced: Tensor | None = None) -> Tens
     for a, b in combinations(found, 2):
         alike, between = a.axis @ b.axis, b.origin - a.origin
         apart = float((between - a.axis * (a.axis @ between)).norm())
-        if abs(float(alike)) > least and apart > LINE:
+        twice = apart <= LINE and abs(float(a.angle - torch.sign(alike) * b.angle)) <= math.radians(WITHIN)
+        if abs(float(alike)) > least and not twice:
             out.append(torch.nn.functional.normalize(a.axis + torch.sign(alike) * b.axis, dim=0))
     if faced is not None and len(faced):
         out += [a.axis for a in found if float((faced @ a.axis).abs().max()) > least]

@@ -66,7 +66,9 @@ def test_two_hinges_agree_on_a_direction():
     left, right = hinge([0.005, 0, 1.0], [0.0, -0.4, 0.0], 60), hinge([0, 0.005, -1.0], [0.0, 0.4, 0.3], 50)
     (both,) = found(left, right)
     assert degrees_between(both, torch.tensor([0.0025, -0.0025, 1.0]).double()) < 0.01
-    assert len(found(left, hinge([0.005, 0, 1.0], [0.0, -0.39, 0.2], 40))) == 0  # on the left one's line
+    assert len(found(left, hinge([0.005, 0, 1.0], [0.0, -0.39, 0.2], 50))) == 0  # the left one, found twice
+    (line,) = found(left, hinge([-0.005, 0, -1.0], [0.0, -0.39, 0.2], 50))  # two on one line, the second turns back
+    assert degrees_between(line, torch.tensor([0.005, 0, 1.0]).double()) < 0.01
     assert len(found(left, hinge([0.0, 0.04, 1.0], [0.0, 0.4, 0.0], 50))) == 0  # two degrees apart
     assert len(found(left)) == 0 and len(found(left, right, kinds=["revolute", "prismatic"])) == 0
 
