@@ -158,20 +158,19 @@ def _view(commands) -> None:
 def _data(commands) -> None:
     data = _add(commands, "data", "check a scene folder or generate a scene")
     actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
-    check = actions.add_parser(
-        "check", help="name the problems of a scene folder", description="Name the problems of a scene folder."
-    )
-    check.add_argument("root", metavar="DIR")
-    check.add_argument("--format", metavar="NAME", help="layout (default: found by looking)")
-    check.add_argument("--strict_paths", "--strict-paths", **STRICT)
-    for action in (_synth, _render, _capture, _board, _prepare):
+    for action in (_check, _synth, _render, _capture, _board, _prepare):
         action(actions)
 
 
+def _check(actions) -> None:
+    check = _add(actions, "check", "name the problems of a scene folder")
+    check.add_argument("root", metavar="DIR")
+    check.add_argument("--format", metavar="NAME", help="layout (default: found by looking)")
+    check.add_argument("--strict_paths", "--strict-paths", **STRICT)
+
+
 def _synth(actions) -> None:
-    synth = actions.add_parser(
-        "synth", help="generate and ray-trace a small scene", description="Generate and ray-trace a small scene."
-    )
+    synth = _add(actions, "synth", "generate and ray-trace a small scene")
     synth.add_argument("out", metavar="OUT", help="folder to write")
     synth.add_argument("--seed", type=int, default=0, metavar="S")
     synth.add_argument("--kind", metavar="NAME", help="kind of object")
