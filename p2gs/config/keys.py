@@ -14,7 +14,7 @@ from p2gs.models.phase import PHASES
 from p2gs.registry import suggest
 from p2gs.types import UserError, short
 
-STAGES = ("single_state", "registration", "discovery", "sharpen", "canonical_fusion", "articulation", "finish")
+STAGES = ("single_state", "registration", "sharpen", "discovery", "canonical_fusion", "articulation", "finish")
 
 
 @dataclass(eq=False)

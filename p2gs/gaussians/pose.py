@@ -10,13 +10,19 @@ from torch import Tensor
 from p2gs.ops.carry import Parts
 from p2gs.ops.carry import carry as carry_all
 from p2gs.ops.se3 import screw_at
-from p2gs.ops.so3 import matrix_to_quat, quat_multiply, quat_normalize
+from p2gs.ops.so3 import matrix_to_quat, quat_multiply, quat_normalize, quat_to_matrix
 from p2gs.types import ArticulatedObject, GaussianTensors
 
 
 def with_static(transforms: Tensor) -> Tensor:
     """[K-1, 4, 4] -> [K, 4, 4] with the identity in slot 0."""
     return torch.cat([torch.eye(4, dtype=transforms.dtype)[None], transforms])
+
+
+def shortest_axes(g: GaussianTensors) -> Tensor:
+    """[N, 3] the axis along which each Gaussian is thinnest: a surface's normal, of either sign."""
+    R = quat_to_matrix(quat_normalize(g.quats))
+    return R.gather(2, g.log_scales.argmin(1)[:, None, None].expand(-1, 3, 1))[..., 0]
 
 
 def carry(g: GaussianTensors, labels: Tensor, transforms: Tensor) -> GaussianTensors:

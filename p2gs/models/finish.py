@@ -16,6 +16,7 @@ from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig, tune
 from p2gs.models.twin_labels import clean_labels, settle_labels, state_labels, surviving_slots
 from p2gs.motion.directions import shared_axes
+from p2gs.motion.fronts import weighed_amounts
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
 from p2gs.motion.refine_motions import Judge, single_ways
@@ -224,6 +225,8 @@ def _founded(
         if len(motions):
             options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
             record.polish = single_ways(judge.states, motions, judge.views, config.polish, judge.stacks, **options)
+            motions = weighed_amounts(judge.states, motions, record.polish, config.polish.free_moving)
+            record.after = motions.transforms
             measure(record, judge, motions, level)
         trust = [e.confidence for e in record.evidence]
         motions, labels, gone = drop_untold(judge, motions, labels, trust, config.min_confidence)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
+from p2gs.gaussians.pose import shortest_axes
 from p2gs.motion.discovery.hypotheses import shared_directions
 from p2gs.motion.discovery.rigid import one_way, perpendicular
 from p2gs.ops import se3, so3
@@ -44,10 +45,9 @@ def _faced(states: list[StateGaussians], chosen: list[Tensor]) -> Tensor:
     for state, of in zip(states, chosen, strict=True):
         g = state.gaussians.detach()
         still = of & g.solid.cpu()
-        R = so3.quat_to_matrix(so3.quat_normalize(g.quats.cpu()[still]))
-        shortest = g.log_scales.cpu()[still].argmin(1)
-        normals.append(R.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0])
-        points.append(g.means.cpu()[still])
+        surface = g[still.to(g.means.device)].to("cpu")
+        normals.append(shortest_axes(surface))
+        points.append(surface.means)
     points, normals = torch.cat(points), torch.cat(normals)
     found = shared_directions(normals).double()
     if not len(found):

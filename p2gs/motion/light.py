@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
-from p2gs.gaussians.pose import with_static
-from p2gs.ops import se3, so3
+from p2gs.gaussians.pose import shortest_axes, with_static
+from p2gs.ops import se3
 from p2gs.ops.knn import knn
 from p2gs.ops.sh import C0, dc_to_rgb
 from p2gs.types import GaussianTensors
@@ -169,8 +169,7 @@ def _seen(g: GaussianTensors, stack: DepthStack, tau: float) -> tuple[Tensor, Te
 
 def _towards(g: GaussianTensors, ways: Tensor) -> Tensor:
     """[N, 3] the shortest axis of each Gaussian, the way that has ``ways`` [N, 3] before it (0: there is none)."""
-    R, shortest = so3.quat_to_matrix(so3.quat_normalize(g.quats)), g.log_scales.argmin(1)
-    normal = R.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
+    normal = shortest_axes(g)
     return normal * (normal * ways).sum(1, keepdim=True).sign()
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from p2gs.gaussians.pose import shortest_axes
 from p2gs.motion.matching import farthest_points
-from p2gs.ops import so3
 from p2gs.ops.sh import dc_to_rgb
 from p2gs.types import GaussianTensors
 
@@ -14,8 +14,7 @@ from p2gs.types import GaussianTensors
 def patches(g: GaussianTensors, size: int, rounds: int = 10) -> Tensor:
     """Patch [N] of each Gaussian: near, alike in facing and colour, ``size`` in the mean (k-means from farthest
     points)."""
-    R = so3.quat_to_matrix(so3.quat_normalize(g.quats))
-    normal = R[torch.arange(len(g)), :, g.log_scales.argmin(1)]
+    normal = shortest_axes(g)
     facing = (normal[:, :, None] * normal[:, None]).flatten(1)
     x = torch.cat([g.means / 0.06, 0.7 * facing, 2 * dc_to_rgb(g.sh[:, 0]).clamp(0, 1)], 1).double()
     centre = x[farthest_points(g.means, max(1, len(g) // size))]

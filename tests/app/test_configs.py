@@ -28,8 +28,8 @@ def test_presets_name_every_stage(name):
     assert list(cfg.phases) == [
         "single_state",
         "registration",
-        "discovery",
         "sharpen",
+        "discovery",
         "canonical_fusion",
         "articulation",
         "finish",

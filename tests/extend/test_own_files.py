@@ -73,7 +73,7 @@ rasterizer: own_noted
 plugins: [my_phases, my_losses.py, my_callbacks, my_data, my_rasterizers]
 num_parts: 3
 data: {depth: never}
-stages: [single_state, registration, discovery, sharpen, canonical_fusion, colours, articulation, finish]
+stages: [single_state, registration, sharpen, discovery, canonical_fusion, colours, articulation, finish]
 phases:
   single_state:
     {steps: 150, initial_gaussians: 1500, levels: [32, 64], level_starts: [0.0, 0.3],

@@ -17,7 +17,7 @@ from whole_runs import CPU, Fit, fit, make_whole
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(0)]
 KILLS = int(os.environ.get("P2GS_KILLS", "100"))
 KILLS_A_RUN = 5  # then it is let go to its end
-STAGES = ("single_state_0", "single_state_1", "discovery", "sharpen_0", "canonical_fusion", "articulation", "finish")
+STAGES = ("single_state_0", "single_state_1", "sharpen_0", "discovery", "canonical_fusion", "articulation", "finish")
 
 
 @pytest.fixture(scope="module")

@@ -117,10 +117,16 @@ def test_options_and_code_of_a_stage_and_of_those_before_it(pipeline, monkeypatc
         return [name for name in before if before[name] != other[name]]
 
     assert differ(keys()) == []
-    assert differ(keys("--phases.sharpen.steps", "7")) == ["sharpen", "canonical_fusion", "articulation", "finish"]
+    assert differ(keys("--phases.sharpen.steps", "7")) == [
+        "sharpen",
+        "discovery",
+        "canonical_fusion",
+        "articulation",
+        "finish",
+    ]
     assert differ(keys("--num_parts", "3")) == ["discovery", "canonical_fusion", "articulation", "finish"]
     assert differ(keys("--phases.discovery.rounds", "1")) == ["discovery", "canonical_fusion", "articulation", "finish"]
-    assert differ(keys("--phases.registration.reach", "0.1"))[:3] == ["registration", "discovery", "sharpen"]
+    assert differ(keys("--phases.registration.reach", "0.1"))[:3] == ["registration", "sharpen", "discovery"]
     assert differ(keys("--callbacks.previews.every", "7")) == []
     real = CodeReader.code_of
     edited = partial(changed_code, real, "p2gs.models.finish")

@@ -99,8 +99,8 @@ def test_the_built_in_phases_fit_together():
     assert [p.gives for p in order.values()] == [
         "states",
         "states",
-        "motions",
         "sharpened",
+        "motions",
         "canonical",
         "learned",
         "twin",

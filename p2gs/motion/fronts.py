@@ -1,0 +1,212 @@
+"""How far a slide went, as its front tells: a plane across the way lies where it was and where it came to.
+
+Photographs of a drawer that was shut tell its way badly: its front ends in a frame of the same colour, its upper edge
+is hidden, and a shift that covers more of it explains more. Its plane is known to a few thousandths all the same.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from p2gs.gaussians.handover import PartMotions, StateGaussians
+from p2gs.gaussians.pose import shortest_axes
+from p2gs.motion.discovery.rows import FACING
+from p2gs.motion.refine_motions import Judge
+from p2gs.motion.surface_fit import ALONG
+from p2gs.ops import se3
+from p2gs.ops.knn import knn, search_tree
+from p2gs.ops.robust import MEDIAN_SIGMA
+
+ROUNDS = 2  # of surfaces looked for: noise lets those win that are near to where they are looked for
+FEWEST = 30  # points of a front in each state: a plate of 5 x 6 of them
+# standard errors, of both states together, by which two halves of a front differ that are two bodies: of 33 fronts two
+# true ones 9.4 and 18, an edge beside a front 17, of one body at most 5.6 where it differed by what surfaces tell apart
+SURE = 7.0
+
+
+@dataclass(frozen=True)
+class Front:
+    """A state's surface across a slide: points [N, 3] where they are at the start, and how much farther along the way
+    than the motion takes them the other state's surface lies, farther [N] (negative: less far). Internal units,
+    float64."""
+
+    points: Tensor
+    farther: Tensor
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def amount(self) -> float:
+        """How much farther the front as a whole went."""
+        return float(self.farther.median())
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of single points, robust."""
+        return MEDIAN_SIGMA * float((self.farther - self.amount).abs().median())
+
+
+def front_of(states: list[StateGaussians], motions: PartMotions, part: int, state: int, reach: float) -> Front:
+    """What of the solid Gaussians of slide ``part`` in ``state`` stands across its way and finds a surface of the other
+    state that does, too: the nearest, where a surface along the way by ``reach`` is as near as one beside it by as much
+    as surfaces' points lie apart (of the nearest in space noise would choose what agrees)."""
+    T = motions.transforms[part].double().cpu()
+    way = torch.nn.functional.normalize(T[:3, 3], dim=0)
+    here, there = _across(states[state], way), _across(states[1 - state], way)
+    means = states[state].gaussians.means.detach().cpu().double()
+    p = means[here & (motions.labels[state].cpu() == part + 1)]
+    q = states[1 - state].gaussians.means.detach().cpu().double()[there & (motions.labels[1 - state].cpu() == part + 1)]
+    if min(len(p), len(q)) < 2 or reach <= 0:
+        return Front(p[:0], p[:0, 0])
+    x = se3.apply(se3.inverse(T) if state else T, p)
+    beside = ALONG * float(knn(q, None, 1, True)[0].median())
+    squeezed = torch.eye(3).double() + (beside / reach - 1) * torch.outer(way, way)  # both limits are ``beside``
+    tree, farther, found = search_tree((q @ squeezed).numpy()), torch.zeros(len(p)).double(), torch.ones(len(p)) > 0
+    for _ in range(ROUNDS):
+        at = x + (farther[found].median() if bool(found.any()) else 0.0) * way
+        off, near = (torch.from_numpy(a) for a in tree.query((at @ squeezed).numpy()))
+        farther, found = (q[near] - x) @ way, off < beside
+    return Front((x if state else p)[found], (-farther if state else farther)[found])
+
+
+def _across(state: StateGaussians, way: Tensor) -> Tensor:
+    """[N] bool: which solid Gaussians stand across a direction [3]."""
+    g = state.gaussians.detach().to("cpu")
+    return g.solid & ((shortest_axes(g).double() @ way).abs() > FACING)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A front that went by two amounts: the plane between them, normal [3] and offset along it, at the start; how much
+    farther than the part's motion what lies before and behind it went; by how many standard errors they differ, both
+    states together; whether the same one went farther in both."""
+
+    normal: Tensor
+    offset: float
+    farther: tuple[float, float]
+    sure: float
+    alike: bool
+
+
+def step_in(fronts: list[Front], directions: Tensor, apart: float) -> Step | None:
+    """Where a slide's front is two that went by amounts which surfaces tell ``apart``, the same one farther in both
+    states (``fronts``), by ``SURE`` standard errors. A rigid body has one amount. Of planes across ``directions`` [D,
+    3] it is the one that leaves least squares of what either half's amount does not explain. None where there is no
+    such step."""
+    best, least = None, 0.0
+    for normal in directions:
+        place = [f.points @ normal for f in fronts]
+        for offset in torch.cat(place).sort().values[FEWEST - 1 :: FEWEST].tolist():
+            halves = [(f.farther[x < offset], f.farther[x >= offset]) for f, x in zip(fronts, place, strict=True)]
+            if min(len(h) for pair in halves for h in pair) < FEWEST:
+                continue
+            left = sum(float((_squares(a) + _squares(b)) / _squares(torch.cat([a, b]))) for a, b in halves)
+            if best is None or left < least:
+                best, least = _step(normal, offset, halves), left
+    told = best is not None and best.alike and abs(best.farther[1] - best.farther[0]) > apart and best.sure > SURE
+    return best if told else None
+
+
+def _step(normal: Tensor, offset: float, halves: list[tuple[Tensor, Tensor]]) -> Step:
+    """The step at a plane, of both states' [N] amounts before and behind it."""
+    steps = [float(b.median() - a.median()) for a, b in halves]
+    sure = [d / math.sqrt(float(a.var() / len(a) + b.var() / len(b))) for d, (a, b) in zip(steps, halves, strict=True)]
+    before, behind = (float(sum(h[i].median() for h in halves)) / 2 for i in (0, 1))
+    return Step(normal, offset, (before, behind), math.hypot(*sure), steps[0] * steps[1] > 0)
+
+
+def _squares(x: Tensor) -> Tensor:
+    """Sum of squared deviations of [N] from their mean."""
+    return (x - x.mean()).square().sum()
+
+
+def part_fronts(
+    judge: Judge,
+    states: list[StateGaussians],
+    motions: PartMotions,
+    directions: Tensor,
+    *,
+    apart: float,
+    reach: float,
+    limit: int,
+) -> tuple[PartMotions, list[dict]]:
+    """Each slide of which the front went by two amounts as two parts, each with its own, up to ``limit`` parts, if the
+    photographs like that no less where it makes a difference (``Judge.own_share``: what lies in an edge is no front).
+    Returns the motions and what was tried: part, both amounts, by how many standard errors they differ, what was saved.
+
+    states: what surfaces are taken from.  directions [D, 3]: of the object.  apart: amounts that surfaces tell apart.
+    reach: how far along the way a surface is looked for. Lengths are internal units.
+    """
+    log: list[dict] = []
+    part = 0
+    while part < len(motions) < limit:
+        step = _step_of(states, motions, part, directions, apart, reach)
+        if step is not None:
+            two = _in_two(states, motions, part, step)
+            saved = judge.own_share(two, motions)
+            amounts = [float(two.transforms[k, :3, 3].norm()) for k in (part, -1)]
+            log.append({"part": part, "amounts": amounts, "standard_errors": step.sure, "own_share": saved})
+            if saved >= 0:
+                motions = two
+                continue
+        part += 1
+    return motions, log
+
+
+def _step_of(
+    states: list[StateGaussians], motions: PartMotions, part: int, directions: Tensor, apart: float, reach: float
+) -> Step | None:
+    """``step_in`` of a part's fronts by planes across ``directions`` [D, 3] that its way lies in; None of a turn."""
+    if motions.types[part] != "prismatic":
+        return None
+    way = torch.nn.functional.normalize(motions.transforms[part][:3, 3], dim=0)
+    along = directions[(directions @ way).abs() < math.sqrt(1 - FACING**2)]
+    return step_in([front_of(states, motions, part, s, reach) for s in (0, 1)], along, apart)
+
+
+def weighed_amounts(
+    states: list[StateGaussians], motions: PartMotions, ways: dict[str, Tensor], reach: float
+) -> PartMotions:
+    """The motions with each slide as long as photographs and its front say together, each weighed by how sure it is:
+    photographs by how far apart both directions put the part (``ways``: "forward" and "backward" [K, 4, 4]), surfaces
+    by how uneven they are. A slide of which either state shows no front stays."""
+    for k, kind in enumerate(motions.types):
+        if kind != "prismatic" or not ways:
+            continue
+        fronts = [front_of(states, motions, k, s, reach) for s in (0, 1)]
+        if min(map(len, fronts)) < FEWEST:
+            continue
+        T = motions.transforms[k]
+        way = torch.nn.functional.normalize(T[:3, 3], dim=0)
+        apart = float((ways["forward"][k] - ways["backward"][k])[:3, 3] @ way) ** 2
+        uneven = sum(f.spread**2 for f in fronts) / 2
+        farther = apart / (apart + uneven) * sum(f.amount for f in fronts) / 2 if apart > 0 else 0.0
+        motions = motions.with_motion(k, kind, slid_farther(T, farther))
+    return motions
+
+
+def _in_two(states: list[StateGaussians], motions: PartMotions, part: int, step: Step) -> PartMotions:
+    """The motions with what of a part lies behind the step's plane as a part of its own, the last, each by its own
+    amount."""
+    T, labels = motions.transforms[part], []
+    for s, (state, of) in enumerate(zip(states, motions.labels, strict=True)):
+        means = state.gaussians.means.detach().double()
+        start = se3.apply(se3.inverse(T).to(means), means) if s else means
+        behind = (of == part + 1) & (start @ step.normal.to(means) >= step.offset)
+        labels.append(torch.where(behind, len(motions) + 1, of))
+    two = motions.with_motion(part, "prismatic", slid_farther(T, step.farther[0]))
+    two = two.with_motion(len(motions), "prismatic", slid_farther(T, step.farther[1]))
+    confidence = torch.cat([motions.confidence, motions.confidence[part : part + 1]])
+    return replace(two, labels=labels, confidence=confidence)
+
+
+def slid_farther(T: Tensor, farther: float) -> Tensor:
+    """A slide [4, 4] that goes ``farther`` along its way."""
+    out = T.clone()
+    out[:3, 3] += farther * torch.nn.functional.normalize(T[:3, 3], dim=0)
+    return out
