@@ -314,7 +314,8 @@ def polishing(record: FinishRecord, twin: ArticulatedObject, states, unit: float
     out: dict[str, Any] = {}
     if record.costs:
         out = {n: {w: record.costs[w][i] for w in record.costs} for i, n in enumerate(names)}
-    out |= {"contents": record.contents, "together": record.together, "laid": record.laid, "joints": []}
+    out |= {"contents": record.contents, "together": record.together, "laid": record.laid, "fronts": record.fronts}
+    out["joints"] = []
     for k, part in enumerate(twin.parts[1:]):
         points = states[0].gaussians.means[record.labels[0] == k + 1]
         shift, turn = apart(record.before[k], record.after[k], points)

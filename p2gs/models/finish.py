@@ -89,7 +89,8 @@ class FinishRecord:
     polish (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
     start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.
     together: image loss with screws held and free (``fit_together``; {}: not tried).
-    laid: axes that were tried along the object's directions (``lay_axes``).  slots: the learned slot of each part.
+    laid: axes that were tried along the object's directions (``lay_axes``).  fronts: of slides, what their fronts said
+    (``weighed_amounts``).  slots: the learned slot of each part.
     contents: Gaussians that became a drawer's because they are on or in its tray.
     """
 
@@ -103,6 +104,7 @@ class FinishRecord:
     slots: list[int] = field(default_factory=list)
     contents: int = 0
     laid: list[dict] = field(default_factory=list)
+    fronts: list[dict] = field(default_factory=list)
     together: dict[str, float] = field(default_factory=dict)
 
 
@@ -225,7 +227,8 @@ def _founded(
         if len(motions):
             options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
             record.polish = single_ways(judge.states, motions, judge.views, config.polish, judge.stacks, **options)
-            motions = weighed_amounts(judge.states, motions, record.polish, config.polish.free_moving)
+            reach = config.polish.free_moving
+            motions, record.fronts = weighed_amounts(judge.states, motions, record.polish, reach)
             record.after = motions.transforms
             measure(record, judge, motions, level)
         trust = [e.confidence for e in record.evidence]

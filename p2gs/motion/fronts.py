@@ -171,23 +171,27 @@ def _step_of(
 
 def weighed_amounts(
     states: list[StateGaussians], motions: PartMotions, ways: dict[str, Tensor], reach: float
-) -> PartMotions:
-    """The motions with each slide as long as photographs and its front say together, each weighed by how sure it is:
-    photographs by how far apart both directions put the part (``ways``: "forward" and "backward" [K, 4, 4]), surfaces
-    by how uneven they are. A slide of which either state shows no front stays."""
+) -> tuple[PartMotions, list[dict]]:
+    """Each slide as long as photographs and its front say together, each weighed by how sure it is: photographs by how
+    far apart both directions put the part (``ways``: "forward" and "backward" [K, 4, 4]), surfaces by how uneven they
+    are. A slide of which either state shows no front stays.
+
+    Returns the motions and of each slide that was weighed: part, how much farther its front went by either state, what
+    of that was taken.
+    """
+    log: list[dict] = []
     for k, kind in enumerate(motions.types):
-        if kind != "prismatic" or not ways:
-            continue
-        fronts = [front_of(states, motions, k, s, reach) for s in (0, 1)]
-        if min(map(len, fronts)) < FEWEST:
+        fronts = [front_of(states, motions, k, s, reach) for s in (0, 1)] if kind == "prismatic" and ways else []
+        if min(map(len, fronts), default=0) < FEWEST:
             continue
         T = motions.transforms[k]
         way = torch.nn.functional.normalize(T[:3, 3], dim=0)
         apart = float((ways["forward"][k] - ways["backward"][k])[:3, 3] @ way) ** 2
         uneven = sum(f.spread**2 for f in fronts) / 2
-        farther = apart / (apart + uneven) * sum(f.amount for f in fronts) / 2 if apart > 0 else 0.0
-        motions = motions.with_motion(k, kind, slid_farther(T, farther))
-    return motions
+        weight = apart / (apart + uneven) if apart > 0 else 1.0  # 0: no photograph pulled either way
+        log.append({"part": k, "farther": [f.amount for f in fronts], "weight": weight})
+        motions = motions.with_motion(k, kind, slid_farther(T, weight * sum(f.amount for f in fronts) / 2))
+    return motions, log
 
 
 def _in_two(states: list[StateGaussians], motions: PartMotions, part: int, step: Step) -> PartMotions:

@@ -45,7 +45,7 @@ class JointEvidence:
     that matters least: the curvature of the photometric cost.  fall: how much it falls in the best of those directions:
     0 at a minimum.
     disagreement: mean distance between the points where the start -> end and the end -> start refinement put the part
-    (internal units; None where there was no such refinement).  views: how many photographs showed enough of the part to
+    (internal units; None where there was no such refinement, 0 where neither pulled at all: nothing was told).  views: how many photographs showed enough of the part to
     be measured.  saved: share of the image loss that the part saves in its own pixels (``own_shares``; None: not
     asked).
     """
@@ -77,7 +77,7 @@ def features(e: JointEvidence) -> list[float]:
     is displaced and falls nowhere, that both directions agree. The last two as logarithms: they span decades. Coverage
     and residual got no weight."""
     least, most = RISE
-    apart = UNTOLD if e.disagreement is None else max(e.disagreement, APART)
+    apart = max(e.disagreement, APART) if e.disagreement else UNTOLD
     return [-e.contradicted, math.log(min(max(e.rise - e.fall, least), most)), -math.log(apart)]
 
 

@@ -79,7 +79,7 @@ def test_of_a_part_that_one_state_does_not_show_nothing_is_said():
     motions.labels[1] = torch.zeros_like(motions.labels[1])
     assert len(front_of(states, motions, 0, 0, REACH)) == 0
     ways = {"forward": motions.transforms + 0.01, "backward": motions.transforms}
-    assert weighed_amounts(states, motions, ways, REACH) is motions
+    assert weighed_amounts(states, motions, ways, REACH) == (motions, [])
 
 
 @pytest.mark.parametrize("step", [0.008, -0.012])
@@ -132,15 +132,16 @@ def test_turns_have_no_front():
     assert one is motions and not log
 
 
-@pytest.mark.parametrize("apart, share", [(0.0, 0.0), (0.0005, 0.0), (NOISE * math.sqrt(2), 0.5), (0.1, 1.0)])
+@pytest.mark.parametrize("apart, share", [(0.0, 1.0), (0.0005, 0.0), (NOISE * math.sqrt(2), 0.5), (0.1, 1.0)])
 def test_photographs_that_agree_with_themselves_outweigh_the_front(apart, share):
     states, motions = drawers([0.2], 0.19)
     other = motions.transforms.clone()
     other[:, 0, 3] += apart
     ways = {"forward": other, "backward": motions.transforms}
-    (T,) = weighed_amounts(states, motions, ways, REACH).transforms
-    assert float(T[0, 3]) == pytest.approx(0.19 + share * 0.01, abs=0.0015)
-    assert weighed_amounts(states, motions, {}, REACH) is motions
+    weighed, (told,) = weighed_amounts(states, motions, ways, REACH)
+    assert told["farther"] == pytest.approx([0.01, 0.01], abs=0.0015) and 0 <= told["weight"] <= 1
+    assert float(weighed.transforms[0, 0, 3]) == pytest.approx(0.19 + share * 0.01, abs=0.0015)
+    assert weighed_amounts(states, motions, {}, REACH) == (motions, [])
 
 
 def test_the_world_may_be_turned():

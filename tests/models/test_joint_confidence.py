@@ -149,5 +149,11 @@ def test_confidence_is_a_probability_that_falls_with_each_measure():
     assert worst.confidence < 0.1 and replace(clean, views=0).confidence == 0
 
 
+def test_that_neither_direction_pulled_is_no_agreement():
+    told = JointEvidence(coverage=0.9, contradicted=0.0, residual=1.0, rise=0.1, fall=0.0, disagreement=1e-6, views=4)
+    silent, unasked = replace(told, disagreement=0.0), replace(told, disagreement=None)
+    assert silent.confidence == unasked.confidence < told.confidence
+
+
 def test_size_of_the_photographs_that_joints_are_measured_in():
     assert measuring_level(TrainingViews([], [100, 400])) == 100 and measuring_level(TrainingViews([], [300])) == 300
