@@ -45,9 +45,9 @@ class JointEvidence:
     that matters least: the curvature of the photometric cost.  fall: how much it falls in the best of those directions:
     0 at a minimum.
     disagreement: mean distance between the points where the start -> end and the end -> start refinement put the part
-    (internal units; None where there was no such refinement, 0 where neither pulled at all: nothing was told).  views: how many photographs showed enough of the part to
-    be measured.  saved: share of the image loss that the part saves in its own pixels (``own_shares``; None: not
-    asked).
+    (internal units; None where there was no such refinement, 0 where neither pulled at all: nothing was told).
+    views: how many photographs showed enough of the part to be measured.  saved: share of the image loss that the part
+    saves in its own pixels (``own_shares``; None: not asked).
     """
 
     coverage: float
