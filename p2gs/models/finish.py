@@ -14,7 +14,7 @@ from p2gs.losses.base import Loss
 from p2gs.models.joint_of import constrain, make_joint, name_types
 from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig, tune
-from p2gs.models.twin_labels import clean_labels, settle_labels, state_labels, surviving_slots
+from p2gs.models.twin_labels import clean_labels, rows_as_found, settle_labels, state_labels, surviving_slots
 from p2gs.motion.directions import shared_axes
 from p2gs.motion.fronts import weighed_amounts
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
@@ -130,12 +130,16 @@ def finish(
     backend: draws the states, twin_backend: the twin in ``tune`` (None: the same).  A part's confidence is
     ``JointEvidence.confidence`` of its joint.
     """
-    labels, alive, notes = _slots(learned, config)
+    matched = discovered is not None and len(discovered) == len(learned.types)
+    labels = learned.part_ids
+    if discovered is not None and matched:
+        labels = rows_as_found(learned, labels, states, discovered, config.polish.free_static)
+    labels, alive, notes = _slots(learned, labels, config)
     keep = torch.tensor([k - 1 for k in alive], dtype=torch.int64)
     types, transforms = _typed(learned, labels, keep, config.prismatic_below)
     time = learned.canonical_time
     axes = torch.full((len(types), 3), torch.nan).double()
-    if discovered is not None and len(discovered) == len(learned.types):
+    if discovered is not None and matched:
         axes = shared_axes(discovered.transforms, discovered.types)[keep]
     options: dict[str, Any] = {"backend": backend, "device": device}
     level = common_level(views)
@@ -164,10 +168,11 @@ def finish(
     return twin, notes, record
 
 
-def _slots(learned: Articulation, config: FinishConfig) -> tuple[Tensor, list[int], list[str]]:
-    """Labels [N] counted by the slots that stay, these slots' numbers, and a line for each that vanishes."""
+def _slots(learned: Articulation, labels: Tensor, config: FinishConfig) -> tuple[Tensor, list[int], list[str]]:
+    """Labels [N], by slot, cleaned and counted by the slots that stay, these slots' numbers, and a line for each that
+    vanishes."""
     slots = len(learned.types)
-    labels = clean_labels(learned.gaussians, learned.part_ids, slots + 1, config.clean_neighbours)
+    labels = clean_labels(learned.gaussians, labels, slots + 1, config.clean_neighbours)
     alive = surviving_slots(learned, labels, config.min_mass, config.min_motion)
     remap = torch.zeros(slots + 1, dtype=torch.int64)
     for new, old in enumerate(alive):

@@ -73,8 +73,9 @@ def find_part_motions(
     if joined:
         motions = judge.refine(motions)
     motions, seamless = join_seamless(judge, motions)
-    apart = {"apart": found.problem.scale.apart, "reach": config.coarse.free_moving, "limit": limit}
-    motions, fronts = part_fronts(judge, sharpened or states, motions, directions_of(states, motions), **apart)
+    surfels, apart = found.problem.surfels, found.problem.scale.apart
+    faced = directions_of(states, motions)
+    motions, fronts = part_fronts(judge, sharpened or states, surfels, motions, faced, apart, limit)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
     motions, _, laid = lay_axes(judge, motions, config.askew, config.part_penalty)
     for part in unfounded:

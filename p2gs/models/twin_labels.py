@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from p2gs.data.views import TrainingViews
-from p2gs.gaussians.handover import Articulation, StateGaussians
+from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.gaussians.pose import carry, with_static
+from p2gs.motion.directions import shared_axes
+from p2gs.motion.discovery.rigid import ONE_WAY
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
 from p2gs.parts.islands import settle_twin_islands
@@ -37,6 +39,38 @@ def clean_labels(g: GaussianTensors, labels: Tensor, parts: int, k: int) -> Tens
     own = torch.arange(len(labels))[:, None]
     index = torch.cat([own, own, index], dim=1)
     return majority(labels, index, torch.sigmoid(g.opacity_logits)[index], parts)[0]
+
+
+def rows_as_found(
+    learned: Articulation, labels: Tensor, states: list[StateGaussians], discovered: PartMotions, tau: float
+) -> Tensor:
+    """Labels [N] in which drawers of a row (``shared_axes``) that put a Gaussian at one place in either state, to
+    within ``tau`` (internal units), have it as discovery had what is next to it: photographs do not tell them apart,
+    and while labels are learned the border that fronts told frays. tau: 0 = off."""
+    ways = shared_axes(discovered.transforms, discovered.types)
+    ends = torch.stack([_at(learned, s) for s in (0, 1)], 1)  # [K, 2, N, 3]
+    own = torch.arange(len(labels))
+    here = ends[labels, :, own]  # [N, 2, 3]
+    nearest, found = torch.full((len(labels),), torch.inf), labels.clone()
+    for s, state in enumerate(states):
+        solid = state.gaussians.solid
+        means = state.gaussians.means.detach()[solid].cpu()
+        d, j = knn(means.contiguous(), here[:, s].float().contiguous(), 1, False)
+        closer = d[:, 0] < nearest
+        nearest = torch.where(closer, d[:, 0], nearest)
+        found = torch.where(closer, discovered.labels[s].cpu()[solid.cpu()][j[:, 0]], found)
+    rows = torch.cat([torch.zeros(1, dtype=torch.bool), ~ways.isnan().any(1)])
+    along = torch.zeros(len(rows), len(rows), dtype=torch.bool)
+    along[1:, 1:] = (ways @ ways.T).abs() > ONE_WAY
+    same = (ends[found, :, own] - here).norm(dim=2).amax(1) < tau
+    return torch.where(rows[labels] & rows[found] & along[labels, found] & same, found, labels)
+
+
+def _at(learned: Articulation, state: int) -> Tensor:
+    """Where every Gaussian is in a state under each slot's motion [K, N, 3], float64; slot 0 stays."""
+    means = learned.gaussians.means.detach().cpu().double()
+    T = with_static(se3.screw_at(learned.transforms.cpu().double(), state - learned.canonical_time))
+    return torch.stack([se3.apply(one, means) for one in T])
 
 
 def surviving_slots(learned: Articulation, labels: Tensor, min_mass: float, min_motion: float) -> list[int]:

@@ -20,6 +20,7 @@ from p2gs.motion.surface_fit import ALONG
 from p2gs.ops import se3
 from p2gs.ops.knn import knn, search_tree
 from p2gs.ops.robust import MEDIAN_SIGMA
+from p2gs.visibility.surfels import Surfels
 
 ROUNDS = 2  # of surfaces looked for: noise lets those win that are near to where they are looked for
 FEWEST = 30  # points of a front in each state: a plate of 5 x 6 of them
@@ -51,16 +52,44 @@ class Front:
         return MEDIAN_SIGMA * float((self.farther - self.amount).abs().median())
 
 
-def front_of(states: list[StateGaussians], motions: PartMotions, part: int, state: int, reach: float) -> Front:
-    """What of the solid Gaussians of slide ``part`` in ``state`` stands across its way and finds a surface of the other
-    state that does, too: the nearest, where a surface along the way by ``reach`` is as near as one beside it by as much
-    as surfaces' points lie apart (of the nearest in space noise would choose what agrees)."""
-    T = motions.transforms[part].double().cpu()
+@dataclass(frozen=True)
+class Surface:
+    """A state's surface points and normals [N, 3], float64, and the part [N] that each belongs to (0 static)."""
+
+    points: Tensor
+    normals: Tensor
+    labels: Tensor
+
+
+def surfaces_of(states: list[StateGaussians], motions: PartMotions) -> list[Surface]:
+    """Both states' solid Gaussians."""
+    out = []
+    for state, labels in zip(states, motions.labels, strict=True):
+        g = state.gaussians.detach().to("cpu")
+        solid = g.solid
+        out.append(Surface(g.means[solid].double(), shortest_axes(g[solid]).double(), labels.cpu()[solid]))
+    return out
+
+
+def surfels_of(surfels: list[Surfels], states: list[StateGaussians], motions: PartMotions) -> list[Surface]:
+    """Both states' surfels, labelled as the solid Gaussian next to each."""
+    out = []
+    for s, gaussians in zip(surfels, surfaces_of(states, motions), strict=True):
+        near = knn(gaussians.points.float().contiguous(), s.points.contiguous(), 1, False)[1][:, 0]
+        out.append(Surface(s.points.double(), s.normals.double(), gaussians.labels[near]))
+    return out
+
+
+def front_of(surfaces: list[Surface], T: Tensor, part: int, state: int, reach: float) -> Front:
+    """What of slide ``part``, of motion T [4, 4], stands across its way in ``state`` and finds such a surface of it in
+    the other state: the nearest, where a surface along the way by ``reach`` is as near as one beside it by as much as
+    surfaces' points lie apart (of the nearest in space noise would choose what agrees)."""
+    T = T.double().cpu()
     way = torch.nn.functional.normalize(T[:3, 3], dim=0)
-    here, there = _across(states[state], way), _across(states[1 - state], way)
-    means = states[state].gaussians.means.detach().cpu().double()
-    p = means[here & (motions.labels[state].cpu() == part + 1)]
-    q = states[1 - state].gaussians.means.detach().cpu().double()[there & (motions.labels[1 - state].cpu() == part + 1)]
+    p, q = (
+        of.points[(of.labels == part + 1) & ((of.normals @ way).abs() > FACING)]
+        for of in (surfaces[state], surfaces[1 - state])
+    )
     if min(len(p), len(q)) < 2 or reach <= 0:
         return Front(p[:0], p[:0, 0])
     x = se3.apply(se3.inverse(T) if state else T, p)
@@ -72,12 +101,6 @@ def front_of(states: list[StateGaussians], motions: PartMotions, part: int, stat
         off, near = (torch.from_numpy(a) for a in tree.query((at @ squeezed).numpy()))
         farther, found = (q[near] - x) @ way, off < beside
     return Front((x if state else p)[found], (-farther if state else farther)[found])
-
-
-def _across(state: StateGaussians, way: Tensor) -> Tensor:
-    """[N] bool: which solid Gaussians stand across a direction [3]."""
-    g = state.gaussians.detach().to("cpu")
-    return g.solid & ((shortest_axes(g).double() @ way).abs() > FACING)
 
 
 @dataclass(frozen=True)
@@ -92,32 +115,44 @@ class Step:
     sure: float
     alike: bool
 
+    @property
+    def size(self) -> float:
+        """By how much the amounts differ."""
+        return abs(self.farther[1] - self.farther[0])
 
-def step_in(fronts: list[Front], directions: Tensor, apart: float) -> Step | None:
-    """Where a slide's front is two that went by amounts which surfaces tell ``apart``, the same one farther in both
-    states (``fronts``), by ``SURE`` standard errors. A rigid body has one amount. Of planes across ``directions`` [D,
-    3] it is the one that leaves least squares of what either half's amount does not explain. None where there is no
-    such step."""
-    best, least = None, 0.0
+
+def border_in(fronts: list[Front], directions: Tensor) -> tuple[Tensor, float] | None:
+    """The plane across one of ``directions`` [D, 3], normal and offset, that parts a slide's front (``fronts`` of both
+    states) in two so that least squares are left of what either half's amount does not explain. None where no plane
+    leaves enough on either side."""
+    best, least = None, math.inf
     for normal in directions:
-        place = [f.points @ normal for f in fronts]
-        for offset in torch.cat(place).sort().values[FEWEST - 1 :: FEWEST].tolist():
-            halves = [(f.farther[x < offset], f.farther[x >= offset]) for f, x in zip(fronts, place, strict=True)]
-            if min(len(h) for pair in halves for h in pair) < FEWEST:
-                continue
-            left = sum(float((_squares(a) + _squares(b)) / _squares(torch.cat([a, b]))) for a, b in halves)
-            if best is None or left < least:
-                best, least = _step(normal, offset, halves), left
-    told = best is not None and best.alike and abs(best.farther[1] - best.farther[0]) > apart and best.sure > SURE
-    return best if told else None
+        places = torch.cat([f.points @ normal for f in fronts]).sort().values
+        for offset in places[FEWEST - 1 :: FEWEST].tolist():
+            halves = _halves(fronts, normal, offset)
+            if halves is not None:
+                left = sum(float((_squares(a) + _squares(b)) / _squares(torch.cat([a, b]))) for a, b in halves)
+                best, least = ((normal, offset), left) if left < least else (best, least)
+    return best
 
 
-def _step(normal: Tensor, offset: float, halves: list[tuple[Tensor, Tensor]]) -> Step:
-    """The step at a plane, of both states' [N] amounts before and behind it."""
+def step_at(fronts: list[Front], normal: Tensor, offset: float) -> Step | None:
+    """By how much the halves of a front (``fronts`` of both states) before and behind a plane differ; None where either
+    is less than a front."""
+    halves = _halves(fronts, normal, offset)
+    if halves is None:
+        return None
     steps = [float(b.median() - a.median()) for a, b in halves]
     sure = [d / math.sqrt(float(a.var() / len(a) + b.var() / len(b))) for d, (a, b) in zip(steps, halves, strict=True)]
     before, behind = (float(sum(h[i].median() for h in halves)) / 2 for i in (0, 1))
     return Step(normal, offset, (before, behind), math.hypot(*sure), steps[0] * steps[1] > 0)
+
+
+def _halves(fronts: list[Front], normal: Tensor, offset: float) -> list[tuple[Tensor, Tensor]] | None:
+    """Of each front the amounts [N] before and behind a plane; None where any are fewer than ``FEWEST``."""
+    behind = [f.points @ normal >= offset for f in fronts]
+    halves = [(f.farther[~b], f.farther[b]) for f, b in zip(fronts, behind, strict=True)]
+    return None if min(len(h) for pair in halves for h in pair) < FEWEST else halves
 
 
 def _squares(x: Tensor) -> Tensor:
@@ -127,27 +162,28 @@ def _squares(x: Tensor) -> Tensor:
 
 def part_fronts(
     judge: Judge,
-    states: list[StateGaussians],
+    sharpened: list[StateGaussians],
+    surfels: list[Surfels],
     motions: PartMotions,
     directions: Tensor,
-    *,
     apart: float,
-    reach: float,
     limit: int,
 ) -> tuple[PartMotions, list[dict]]:
-    """Each slide of which the front went by two amounts as two parts, each with its own, up to ``limit`` parts, if the
+    """Each slide of which the front went by two amounts as two parts, each with its own, up to ``limit`` parts: by
+    amounts that surfaces tell ``apart``, the same one farther in both states, by ``SURE`` standard errors, and if the
     photographs like that no less where it makes a difference (``Judge.own_share``: what lies in an edge is no front).
-    Returns the motions and what was tried: part, both amounts, by how many standard errors they differ, what was saved.
+    ``surfels`` of both states, which are smooth, say where the border is, ``sharpened`` Gaussians by how much the
+    halves differ.
 
-    states: what surfaces are taken from.  directions [D, 3]: of the object.  apart: amounts that surfaces tell apart.
-    reach: how far along the way a surface is looked for. Lengths are internal units.
+    directions [D, 3]: of the object. Lengths are internal units. Returns the motions and what was tried: part, both
+    amounts, by how many standard errors they differ, what was saved.
     """
     log: list[dict] = []
     part = 0
     while part < len(motions) < limit:
-        step = _step_of(states, motions, part, directions, apart, reach)
-        if step is not None:
-            two = _in_two(states, motions, part, step)
+        step = _step_of(judge, sharpened, surfels, motions, part, directions)
+        if step is not None and step.alike and step.size > apart and step.sure > SURE:
+            two = _in_two(judge.states, motions, part, step)
             saved = judge.own_share(two, motions)
             amounts = [float(two.transforms[k, :3, 3].norm()) for k in (part, -1)]
             log.append({"part": part, "amounts": amounts, "standard_errors": step.sure, "own_share": saved})
@@ -159,14 +195,25 @@ def part_fronts(
 
 
 def _step_of(
-    states: list[StateGaussians], motions: PartMotions, part: int, directions: Tensor, apart: float, reach: float
+    judge: Judge,
+    sharpened: list[StateGaussians],
+    surfels: list[Surfels],
+    motions: PartMotions,
+    part: int,
+    directions: Tensor,
 ) -> Step | None:
-    """``step_in`` of a part's fronts by planes across ``directions`` [D, 3] that its way lies in; None of a turn."""
+    """What the sharpened Gaussians say of a part's front at the border that surfels see in it, of planes across
+    ``directions`` [D, 3] that its way lies in; None of a turn, and where there is no front."""
     if motions.types[part] != "prismatic":
         return None
-    way = torch.nn.functional.normalize(motions.transforms[part][:3, 3], dim=0)
-    along = directions[(directions @ way).abs() < math.sqrt(1 - FACING**2)]
-    return step_in([front_of(states, motions, part, s, reach) for s in (0, 1)], along, apart)
+    T, reach = motions.transforms[part], judge.config.free_moving
+    along = directions[(directions @ torch.nn.functional.normalize(T[:3, 3], dim=0)).abs() < math.sqrt(1 - FACING**2)]
+    smooth = surfels_of(surfels, judge.states, motions)
+    border = border_in([front_of(smooth, T, part, s, reach) for s in (0, 1)], along)
+    if border is None:
+        return None
+    surfaces = surfaces_of(sharpened, motions)
+    return step_at([front_of(surfaces, T, part, s, reach) for s in (0, 1)], *border)
 
 
 def weighed_amounts(
@@ -180,11 +227,11 @@ def weighed_amounts(
     of that was taken.
     """
     log: list[dict] = []
-    for k, kind in enumerate(motions.types):
-        fronts = [front_of(states, motions, k, s, reach) for s in (0, 1)] if kind == "prismatic" and ways else []
+    surfaces = surfaces_of(states, motions)
+    for k, (kind, T) in enumerate(zip(motions.types, motions.transforms, strict=True)):
+        fronts = [front_of(surfaces, T, k, s, reach) for s in (0, 1)] if kind == "prismatic" and ways else []
         if min(map(len, fronts), default=0) < FEWEST:
             continue
-        T = motions.transforms[k]
         way = torch.nn.functional.normalize(T[:3, 3], dim=0)
         apart = float((ways["forward"][k] - ways["backward"][k])[:3, 3] @ way) ** 2
         uneven = sum(f.spread**2 for f in fronts) / 2

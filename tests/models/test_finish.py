@@ -13,7 +13,7 @@ from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.finish import FinishConfig, finish
 from p2gs.models.joint_of import constrain, make_joint, name_types
 from p2gs.models.tune import TuneConfig
-from p2gs.models.twin_labels import clean_labels, majority, state_labels, surviving_slots
+from p2gs.models.twin_labels import clean_labels, majority, rows_as_found, state_labels, surviving_slots
 from p2gs.motion.joint_confidence import state_depth
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
@@ -47,6 +47,26 @@ def test_clean_labels_mends_a_lone_flip():
     flipped[7] = 1 - flipped[7]
     assert torch.equal(clean_labels(g, flipped, 2, 8), labels)
     assert torch.equal(clean_labels(g, flipped, 2, 0), flipped)
+
+
+@pytest.mark.parametrize("second, kinds, mended", [(0.206, "ss", True), (0.3, "ss", False), (0.206, "rs", False)])
+def test_the_border_of_drawers_that_went_nearly_alike_stays_where_it_was_found(second, kinds, mended):
+    """Two drawers side by side, a few Gaussians of which were learned for the other's."""
+    points = torch.cartesian_prod(torch.linspace(0, 1, 20), torch.linspace(0, 0.4, 8), torch.zeros(1)).float()
+    n, found = len(points), 1 + (points[:, 0] > 0.5).long()
+    quats, scales = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1), torch.full((n, 3), -4.0)
+    g = GaussianTensors(points, quats, scales, torch.full((n,), 4.0), torch.zeros(n, 1, 3))
+    T = torch.eye(4).double().repeat(2, 1, 1)
+    T[:, 2, 3] = torch.tensor([0.2, second])
+    types = ["prismatic" if k == "s" else "revolute" for k in kinds]
+    end = points + T[found - 1][:, :3, 3].float()
+    states = [StateGaussians(0, g), StateGaussians(1, g.placed(end, quats))]
+    discovered = PartMotions(types, T, torch.ones(2), [found, found], [torch.ones(n)] * 2)
+    labels = torch.where(torch.arange(n) % 7 == 0, 3 - found, found)
+    learned = Articulation(g, torch.eye(3)[labels], types, T, torch.ones(2), 0.0)
+    kept = rows_as_found(learned, labels, states, discovered, 0.02)
+    assert torch.equal(kept, found if mended else labels)
+    assert torch.equal(rows_as_found(learned, labels, states, discovered, 0.0), labels)
 
 
 def test_a_state_takes_the_twins_labels_but_for_what_the_twin_does_not_have():
