@@ -16,7 +16,6 @@ from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig, tune
 from p2gs.models.twin_labels import clean_labels, rows_as_found, settle_labels, state_labels, surviving_slots
 from p2gs.motion.directions import shared_axes
-from p2gs.motion.fronts import weighed_amounts
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
 from p2gs.motion.refine_motions import Judge, single_ways
@@ -24,6 +23,7 @@ from p2gs.motion.screw_polish import PolishConfig, photometric_cost
 from p2gs.motion.survey import leave_false_minima
 from p2gs.ops import se3
 from p2gs.parts.askew import keep_axes, lay_axes, on_axes
+from p2gs.parts.fronts import weighed_amounts
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import drop_needless, drop_untold, own_shares, settle_types
 from p2gs.types import ArticulatedObject, GaussianTensors, Part, Similarity

@@ -17,7 +17,6 @@ from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.models.stage import Stage, register_phase
 from p2gs.motion.directions import directions_of
 from p2gs.motion.discovery import Discovery, StateEvidence, discover, relabel
-from p2gs.motion.fronts import part_fronts
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.relabel import label_gaussians
 from p2gs.motion.survey import leave_false_minima
@@ -25,6 +24,7 @@ from p2gs.native import at_once
 from p2gs.parts.askew import lay_axes
 from p2gs.parts.bodies import Surfaces, one_part_a_body
 from p2gs.parts.expand import expand
+from p2gs.parts.fronts import part_fronts
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import join_twins, settle_types, simplify
 from p2gs.parts.seams import join_seamless

@@ -8,7 +8,8 @@ import torch
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.gaussians.pose import shortest_axes
-from p2gs.motion.fronts import (
+from p2gs.ops import so3
+from p2gs.parts.fronts import (
     FEWEST,
     Front,
     Surface,
@@ -20,7 +21,6 @@ from p2gs.motion.fronts import (
     surfels_of,
     weighed_amounts,
 )
-from p2gs.ops import so3
 from p2gs.types import GaussianTensors
 from p2gs.visibility.surfels import Surfels
 

@@ -1,7 +1,8 @@
 """How far a slide went, as its front tells: a plane across the way lies where it was and where it came to.
 
 Photographs of a drawer that was shut tell its way badly: its front ends in a frame of the same colour, its upper edge
-is hidden, and a shift that covers more of it explains more. Its plane is known to a few thousandths all the same.
+is hidden, and a shift that covers more of it explains more. Its plane is known to a few thousandths all the same. And a
+rigid body goes by one amount: a front that went by two is two drawers'.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from p2gs.motion.surface_fit import ALONG
 from p2gs.ops import se3
 from p2gs.ops.knn import knn, search_tree
 from p2gs.ops.robust import MEDIAN_SIGMA
+from p2gs.parts.bodies import FEWEST
 from p2gs.visibility.surfels import Surfels
 
 ROUNDS = 2  # of surfaces looked for: noise lets those win that are near to where they are looked for
-FEWEST = 30  # points of a front in each state: a plate of 5 x 6 of them
 # standard errors, of both states together, by which two halves of a front differ that are two bodies: of 33 fronts two
 # true ones 9.4 and 18, an edge beside a front 17, of one body at most 5.6 where it differed by what surfaces tell apart
 SURE = 7.0
