@@ -130,16 +130,17 @@ def finish(
     backend: draws the states, twin_backend: the twin in ``tune`` (None: the same).  A part's confidence is
     ``JointEvidence.confidence`` of its joint.
     """
-    matched = discovered is not None and len(discovered) == len(learned.types)
+    if discovered is not None and len(discovered) != len(learned.types):
+        discovered = None  # slots were asked for
     labels = learned.part_ids
-    if discovered is not None and matched:
+    if discovered is not None:
         labels = rows_as_found(learned, labels, states, discovered, config.polish.free_static)
     labels, alive, notes = _slots(learned, labels, config)
     keep = torch.tensor([k - 1 for k in alive], dtype=torch.int64)
     types, transforms = _typed(learned, labels, keep, config.prismatic_below)
     time = learned.canonical_time
     axes = torch.full((len(types), 3), torch.nan).double()
-    if discovered is not None and matched:
+    if discovered is not None:
         axes = shared_axes(discovered.transforms, discovered.types)[keep]
     options: dict[str, Any] = {"backend": backend, "device": device}
     level = common_level(views)

@@ -144,9 +144,10 @@ def step_at(fronts: list[Front], normal: Tensor, offset: float) -> Step | None:
     if halves is None:
         return None
     steps = [float(b.median() - a.median()) for a, b in halves]
-    sure = [d / math.sqrt(float(a.var() / len(a) + b.var() / len(b))) for d, (a, b) in zip(steps, halves, strict=True)]
+    errors = [math.sqrt(float(a.var() / len(a) + b.var() / len(b)) + 1e-12) for a, b in halves]
     before, behind = (float(sum(h[i].median() for h in halves)) / 2 for i in (0, 1))
-    return Step(normal, offset, (before, behind), math.hypot(*sure), steps[0] * steps[1] > 0)
+    sure = math.hypot(*(d / e for d, e in zip(steps, errors, strict=True)))
+    return Step(normal, offset, (before, behind), sure, steps[0] * steps[1] > 0)
 
 
 def _halves(fronts: list[Front], normal: Tensor, offset: float) -> list[tuple[Tensor, Tensor]] | None:
