@@ -111,6 +111,8 @@ class Case:
         registration = handover.load(run / "checkpoints" / "registration.pt")[0]
         self.pipeline.context.take(register_views(correct_scene(self.pipeline.scene, states), registration))
         self.states = [register_state(s, registration) for s in states]
+        sharp = [run / "checkpoints" / f"sharpen_{s}.pt" for s in (0, 1)]
+        self.sharpened = [handover.load(f)[0] for f in sharp] if all(f.exists() for f in sharp) else None
         self.scene, self.cfg = self.pipeline.scene, self.pipeline.cfg
         self.truth = load_ground_truth(self.cfg.data.root)
         names = next(
@@ -161,6 +163,7 @@ class Case:
             self.pipeline.views,
             self.cfg.num_parts,
             self.cfg.phases["discovery"].config,
+            sharpened=self.sharpened,
             seed=self.cfg.seed,
             backend=self.cfg.rasterizer,
             device=self.pipeline.device,
