@@ -3,10 +3,10 @@ phase may.
 
     python bench/ladder.py RUN... [--zoo DIR] [--out FILE]
 
-RUN holds the single states of a scene (``p2gs fit ... --only single_state``). Discovery is run from them, anew, with
-this build's defaults, and its joints are held against the true ones: right is type, axis <= 1 deg, position x10 <=
-0.15, motion <= 1 deg or 0.01, or a listed tie. A line of JSON per run goes to FILE. DIR: the zoo's lists of scenes and
-ties.
+RUN holds the single states of a scene (``p2gs fit ... --only single_state``), sharpened ones where it went on so far.
+Discovery is run from them, anew, with this build's defaults, and its joints are held against the true ones: right is
+type, axis <= 1 deg, position x10 <= 0.15, motion <= 1 deg or 0.01, or a listed tie. A line of JSON per run goes to
+FILE. DIR: the zoo's lists of scenes and ties.
 """
 
 from __future__ import annotations
