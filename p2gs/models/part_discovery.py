@@ -73,9 +73,11 @@ def find_part_motions(
     if joined:
         motions = judge.refine(motions)
     motions, seamless = join_seamless(judge, motions)
-    surfels, apart = found.problem.surfels, found.problem.scale.apart
-    faced = directions_of(states, motions)
-    motions, fronts = part_fronts(judge, sharpened or states, surfels, motions, faced, apart, limit)
+    fronts: list[dict] = []
+    if "prismatic" in motions.types:
+        surfels, apart = found.problem.surfels, found.problem.scale.apart
+        faced = directions_of(states, motions)
+        motions, fronts = part_fronts(judge, sharpened or states, surfels, motions, faced, apart, limit)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
     motions, _, laid = lay_axes(judge, motions, config.askew, config.part_penalty)
     for part in unfounded:

@@ -11,7 +11,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.gaussians.pose import carry, with_static
 from p2gs.motion.directions import shared_axes
-from p2gs.motion.discovery.rigid import ONE_WAY
+from p2gs.motion.discovery.rigid import one_way
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
 from p2gs.parts.islands import settle_twin_islands
@@ -48,6 +48,11 @@ def rows_as_found(
     within ``tau`` (internal units), have it as discovery had what is next to it: photographs do not tell them apart,
     and while labels are learned the border that fronts told frays. tau: 0 = off."""
     ways = shared_axes(discovered.transforms, discovered.types)
+    row = torch.zeros(len(ways) + 1, len(ways) + 1, dtype=torch.bool)  # is a slot of one row with another? 0 is of none
+    for k, way in enumerate(ways):
+        row[k + 1, 1:] = one_way(ways, way)
+    if not bool(row.any()):
+        return labels
     ends = torch.stack([_at(learned, s) for s in (0, 1)], 1)  # [K, 2, N, 3]
     own = torch.arange(len(labels))
     here = ends[labels, :, own]  # [N, 2, 3]
@@ -59,11 +64,8 @@ def rows_as_found(
         closer = d[:, 0] < nearest
         nearest = torch.where(closer, d[:, 0], nearest)
         found = torch.where(closer, discovered.labels[s].cpu()[solid.cpu()][j[:, 0]], found)
-    rows = torch.cat([torch.zeros(1, dtype=torch.bool), ~ways.isnan().any(1)])
-    along = torch.zeros(len(rows), len(rows), dtype=torch.bool)
-    along[1:, 1:] = (ways @ ways.T).abs() > ONE_WAY
     same = (ends[found, :, own] - here).norm(dim=2).amax(1) < tau
-    return torch.where(rows[labels] & rows[found] & along[labels, found] & same, found, labels)
+    return torch.where(row[labels, found] & same, found, labels)
 
 
 def _at(learned: Articulation, state: int) -> Tensor:

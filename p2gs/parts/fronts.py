@@ -15,6 +15,7 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.gaussians.pose import shortest_axes
+from p2gs.motion.directions import axis_of
 from p2gs.motion.discovery.rows import FACING
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.surface_fit import ALONG
@@ -86,7 +87,7 @@ def front_of(surfaces: list[Surface], T: Tensor, part: int, state: int, reach: f
     the other state: the nearest, where a surface along the way by ``reach`` is as near as one beside it by as much as
     surfaces' points lie apart (of the nearest in space noise would choose what agrees)."""
     T = T.double().cpu()
-    way = torch.nn.functional.normalize(T[:3, 3], dim=0)
+    way = axis_of("prismatic", T)
     p, q = (
         of.points[(of.labels == part + 1) & ((of.normals @ way).abs() > FACING)]
         for of in (surfaces[state], surfaces[1 - state])
@@ -209,7 +210,7 @@ def _step_of(
     if motions.types[part] != "prismatic":
         return None
     T, reach = motions.transforms[part], judge.config.free_moving
-    along = directions[(directions @ torch.nn.functional.normalize(T[:3, 3], dim=0)).abs() < math.sqrt(1 - FACING**2)]
+    along = directions[(directions @ axis_of("prismatic", T)).abs() < math.sqrt(1 - FACING**2)]
     smooth = surfels_of(surfels, judge.states, motions)
     border = border_in([front_of(smooth, T, part, s, reach) for s in (0, 1)], along)
     if border is None:
@@ -225,21 +226,22 @@ def weighed_amounts(
     far apart both directions put the part (``ways``: "forward" and "backward" [K, 4, 4]), surfaces by how uneven they
     are. A slide of which either state shows no front stays.
 
-    Returns the motions and of each slide that was weighed: part, how much farther its front went by either state, what
-    of that was taken.
+    Returns the motions and of each slide that was weighed: part, how much farther its front went by either state, the
+    front's weight.
     """
     log: list[dict] = []
-    surfaces = surfaces_of(states, motions)
-    for k, (kind, T) in enumerate(zip(motions.types, motions.transforms, strict=True)):
-        fronts = [front_of(surfaces, T, k, s, reach) for s in (0, 1)] if kind == "prismatic" and ways else []
-        if min(map(len, fronts), default=0) < FEWEST:
+    slides = [k for k, kind in enumerate(motions.types) if kind == "prismatic"] if ways else []
+    surfaces = surfaces_of(states, motions) if slides else []
+    for k in slides:
+        T = motions.transforms[k]
+        fronts = [front_of(surfaces, T, k, s, reach) for s in (0, 1)]
+        if min(map(len, fronts)) < FEWEST:
             continue
-        way = torch.nn.functional.normalize(T[:3, 3], dim=0)
-        apart = float((ways["forward"][k] - ways["backward"][k])[:3, 3] @ way) ** 2
+        apart = float((ways["forward"][k] - ways["backward"][k])[:3, 3] @ axis_of("prismatic", T)) ** 2
         uneven = sum(f.spread**2 for f in fronts) / 2
         weight = apart / (apart + uneven) if apart > 0 else 1.0  # 0: no photograph pulled either way
         log.append({"part": k, "farther": [f.amount for f in fronts], "weight": weight})
-        motions = motions.with_motion(k, kind, slid_farther(T, weight * sum(f.amount for f in fronts) / 2))
+        motions = motions.with_motion(k, "prismatic", slid_farther(T, weight * sum(f.amount for f in fronts) / 2))
     return motions, log
 
 
@@ -261,5 +263,5 @@ def _in_two(states: list[StateGaussians], motions: PartMotions, part: int, step:
 def slid_farther(T: Tensor, farther: float) -> Tensor:
     """A slide [4, 4] that goes ``farther`` along its way."""
     out = T.clone()
-    out[:3, 3] += farther * torch.nn.functional.normalize(T[:3, 3], dim=0)
+    out[:3, 3] += farther * axis_of("prismatic", T)
     return out
