@@ -193,13 +193,14 @@ def evidence_points(motions: PartMotions, state: StateGaussians) -> tuple[Tensor
 
 def discovery(motions: PartMotions, unit: float) -> dict:
     """Explanations that were compared, with their image losses; parts that were dropped or merged, with the reason;
-    what was tried when the best was reconsidered."""
+    what was tried when the best was reconsidered; which parts beside each other were asked whether they are one."""
     told = motions.diagnostics
     return {
         "chosen": told.get("explanation"),
         "explanations": told.get("explanations", []),
         "reconsidered": told.get("reconsidered", []),
         "candidates": told.get("candidates", []),
+        "seamless": told.get("seamless", []),
         "parts": [
             {"part": k + 1, "type": t, **amount(t, T, unit), "confidence": float(c)}
             for k, (t, T, c) in enumerate(zip(motions.types, motions.transforms, motions.confidence, strict=True))

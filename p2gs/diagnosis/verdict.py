@@ -134,6 +134,11 @@ def _discovery(d: dict, say) -> None:
         what = {"merge": "was merged into a neighbour that moves alike", "drop": "was dropped"}[r["change"]]
         why = f"it {told_saved(r)}; energy without it {r['energy']:+.3f}"
         say("discovery", f"A {r['type']} part {what}: {why}.", "note")
+    for pair in found.get("seamless", []):
+        if pair.get("joined", True):  # older discoveries list no others
+            start, end = (f"{100 * share:.0f} %" for share in pair["without_edge"])
+            why = f"{start} of the start's photographs and {end} of the end's show no edge between them"
+            say("discovery", f"Two parts became one: {why}, and surfaces do not tell them apart.", "note")
     for name, s in d["labels"].items():
         for k, share in enumerate(s["ambiguous_by_part"]):
             if k and share > limit("ambiguous"):

@@ -1,6 +1,7 @@
 """Two parts without a seam are one body: where one thing ends and another begins that can move without it, photographs
-show an edge (a gap, a step in colour or shade, what is behind) in at least one of the states. A plain plate that was
-torn in two, each piece with a motion that its plain surface hardly tells from the other's, has none in either."""
+show an edge (a gap, a step in colour or shade, what is behind) in at least one of the states, or surfaces tell the two
+motions apart, as those of two doors on one hinge line that are open by unlike angles. A plain plate that was torn in
+two, each piece with a motion that its plain surface hardly tells from the other's, has neither."""
 
 from __future__ import annotations
 
@@ -21,27 +22,33 @@ from p2gs.visibility.free_space import SURFACE
 VIEWS = 24  # photographs of a state that are looked at
 EDGE = 2  # pixels on either side of a pixel within which an edge counts as there
 FEWEST = 10  # pixels of common border by which a photograph shows two parts beside each other
-# share of such photographs without an edge, in either state, above which two parts are one: of seventeen pairs of true
-# parts of twelve objects at most 0.50, of two plates torn in two 0.79 and 1
-MOST = 2 / 3
+MOST = 0.5  # share of such photographs without an edge, in either state, above which surfaces are asked
 EIGHT = np.ones((3, 3), bool)  # neighbours of a pixel
 
 
 def join_seamless(judge: Judge, motions: PartMotions) -> tuple[PartMotions, list[dict]]:
-    """One part for every two that have a common border in both states and no edge along it (``seamless``): with the
-    motion of either, refined, whichever explains more. Returns the motions and what was joined: the two parts and the
-    shares of photographs without an edge."""
+    """One part for every two that have a common border in both states and no edge along it (``seamless``), and that
+    surfaces do not tell apart: as one, with the motion of either, refined, whichever explains more, their energy is no
+    higher. Returns the motions and what was asked: the two parts, the shares of photographs without an edge, by how
+    much the surfaces' energy is higher as one, and whether they were joined."""
     log: list[dict] = []
-    while len(motions) > 1:
-        shares = seamless(judge, motions)
-        pair = max(shares, key=lambda p: min(shares[p]), default=None)
-        if pair is None or min(shares[pair]) < MOST:
-            return motions, log
-        log.append({"parts": list(pair), "without_edge": list(shares[pair])})
-        both = [without_part(motions, a, b + 1) for a, b in (pair, pair[::-1])]
-        one, other = at_once(judge.refine, both)
-        motions = one if judge.gain(one, other) > 0 else other
+    while (found := _joined(judge, motions, log)) is not None:
+        motions = found
     return motions, log
+
+
+def _joined(judge: Judge, motions: PartMotions, log: list[dict]) -> PartMotions | None:
+    """The motions with two parts as one, those with fewest edges between them first; None where no two are."""
+    shares = seamless(judge, motions) if len(motions) > 1 else {}
+    for a, b in sorted((p for p in shares if min(shares[p]) > MOST), key=lambda p: -min(shares[p])):
+        one, other = at_once(judge.refine, [without_part(motions, a, b + 1), without_part(motions, b, a + 1)])
+        fewer = one if judge.gain(one, other) > 0 else other
+        worse = judge.surfaces(fewer) - judge.surfaces(motions)
+        asked = {"parts": [a, b], "without_edge": list(shares[a, b]), "surfaces": worse, "joined": worse <= 0}
+        log.append(asked)
+        if asked["joined"]:
+            return fewer
+    return None
 
 
 def seamless(judge: Judge, motions: PartMotions) -> dict[tuple[int, int], tuple[float, float]]:

@@ -51,6 +51,10 @@ def small_run(found=None, polish_steps=0):
                 ],
             }
         ],
+        "seamless": [
+            {"parts": [0, 1], "without_edge": [1.0, 0.83], "surfaces": -0.03, "joined": True},
+            {"parts": [0, 1], "without_edge": [1.0, 0.67], "surfaces": 0.09, "joined": False},
+        ],
         "evidence": [labels.to(torch.int8)] * 2,
         "states": [{"moved": 300, "static": 300, "unknown": 0}] * 2,
         "min_opacity": 0.5,
@@ -89,6 +93,10 @@ def test_a_right_run_has_no_warning(right):
     assert any(t.startswith("A prismatic part was dropped: it saved 0.1 % of the image loss") for t in notes)
     assert any("saved 7 % of the image loss in its own pixels" in t for t in notes)
     assert any(t.startswith("A revolute part was dropped: it saved 10.0 % of the image loss") for t in notes)
+    assert [t for t in notes if "became one" in t] == [
+        "Two parts became one: 100 % of the start's photographs and 83 % of the end's show no edge between them, and "
+        "surfaces do not tell them apart."
+    ]
     (joint,) = right["joints"]
     assert joint["confidence"] > 0.7 and set(joint["confidence_by_stage"]) == {"discovery", "articulation", "finish"}
     assert right["single_state"]["start"]["psnr"] > 30 and right["single_state"]["start"]["alpha_iou"] > 0.95

@@ -11,6 +11,7 @@ from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
 from p2gs.ops.sh import C0
+from p2gs.parts import seams
 from p2gs.parts.seams import EDGE, contrast_of, join_seamless, parted_by_an_edge, seamless
 from p2gs.types import GaussianTensors
 from tests.models.tiny import photographs
@@ -69,10 +70,11 @@ def plates(right: float) -> tuple[GaussianTensors, torch.Tensor]:
 
 @dataclass
 class Told:
-    """A judge that likes a small angle, and refines nothing."""
+    """A judge that likes a small angle, and refines nothing. as_one: what surfaces say against a part less."""
 
     states: list
     views: dict
+    as_one: float = 0.0
     backend: str = "auto"
     device: str = "cpu"
     config = PolishConfig()
@@ -82,6 +84,9 @@ class Told:
 
     def refine(self, motions):
         return motions
+
+    def surfaces(self, motions):
+        return -self.as_one * len(motions)
 
     @staticmethod
     def angle(motions) -> float:
@@ -104,7 +109,8 @@ def test_a_plate_torn_in_two_becomes_one_with_the_better_motion(right, parts, sm
     if parts == 1:
         assert torch.equal(joined.transforms[0], T[smaller])
         assert all(bool((of == 1).all()) for of in joined.labels)
-        assert log == [{"parts": [0, 1], "without_edge": list(shares)}] and min(shares) > 0.9
+        assert log == [{"parts": [0, 1], "without_edge": list(shares), "surfaces": 0.0, "joined": True}]
+        assert min(shares) > 0.9
     else:
         assert joined is motions and log == [] and max(shares) < 0.2
 
@@ -123,3 +129,22 @@ def test_parts_that_only_one_state_shows_beside_each_other_stay_two():
     judge = Told(states, views)
     assert seamless(judge, motions) == {}
     assert len(join_seamless(judge, motions)[0]) == 2
+
+
+@pytest.mark.parametrize(("more", "parts"), [(0.1, 2), (0.0, 1), (-0.02, 1)])
+def test_what_shows_no_edge_stays_two_where_surfaces_tell_it_apart(monkeypatch, more, parts):
+    shares = {(0, 1): (1.0, 0.7), (1, 2): (0.9, 0.9), (0, 2): (0.2, 1.0)}  # nobody asks the last pair
+    monkeypatch.setattr(seams, "seamless", lambda judge, motions: shares if len(motions) > 2 else {})
+    turns = torch.stack([se3.from_screw(torch.eye(3)[2].double(), torch.zeros(3).double(), torch.tensor(a).double())
+                         for a in (0.3, 0.4, 0.6)])  # fmt: skip
+    labels = torch.tensor([0, 1, 2, 3])
+    motions = PartMotions(["revolute"] * 3, turns, torch.ones(3), [labels] * 2, [torch.ones(4)] * 2)
+    judge = Told([], {}, as_one=more)
+    joined, log = join_seamless(judge, motions)
+    assert [x["parts"] for x in log] == [[1, 2], [0, 1]][: 1 if parts == 1 else 2]  # fewest edges first
+    assert [x["surfaces"] for x in log] == pytest.approx([more] * len(log))
+    assert [x["joined"] for x in log] == [parts == 1] * len(log)
+    if parts == 1:
+        assert torch.equal(joined.transforms, turns[:2]) and joined.labels[0].tolist() == [0, 1, 2, 2]
+    else:
+        assert joined is motions
