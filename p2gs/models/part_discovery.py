@@ -30,6 +30,7 @@ from p2gs.parts.part_choices import join_twins, settle_types, simplify
 from p2gs.parts.seams import join_seamless
 from p2gs.parts.seek import seek
 from p2gs.parts.settle import drop_unfounded, reconsider, settle_labels
+from p2gs.parts.side_by_side import part_side_by_side
 from p2gs.parts.slots import merge_to
 from p2gs.types import TwoStateScene, UserError
 from p2gs.visibility.evidence import gather_evidence
@@ -72,12 +73,13 @@ def find_part_motions(
     motions, joined = join_twins(states, motions, found.problem.scale.apart)
     if joined:
         motions = judge.refine(motions)
+    surfels, apart = found.problem.surfels, found.problem.scale.apart
+    faced = directions_of(states, motions) if "prismatic" in motions.types else torch.zeros(0, 3).double()
+    motions, beside = part_side_by_side(states, surfels, motions, faced, apart, limit)
+    if beside:
+        motions = judge.improved(motions)[2]
     motions, seamless = join_seamless(judge, motions)
-    fronts: list[dict] = []
-    if "prismatic" in motions.types:
-        surfels, apart = found.problem.surfels, found.problem.scale.apart
-        faced = directions_of(states, motions)
-        motions, fronts = part_fronts(judge, sharpened or states, surfels, motions, faced, apart, limit)
+    motions, fronts = part_fronts(judge, sharpened or states, surfels, motions, faced, apart, limit)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
     motions, _, laid = lay_axes(judge, motions, config.askew, config.part_penalty)
     for part in unfounded:
@@ -95,6 +97,7 @@ def find_part_motions(
         **improved,
         "rounds": rounds,
         "joined": joined,
+        "side_by_side": beside,
         "seamless": seamless,
         "fronts": fronts,
         "unfounded": unfounded,

@@ -186,7 +186,7 @@ def part_fronts(
     while part < len(motions) < limit:
         step = _step_of(judge, sharpened, surfels, motions, part, directions)
         if step is not None and step.alike and step.size > apart and step.sure > SURE:
-            two = _in_two(judge.states, motions, part, step)
+            two = in_two(judge.states, motions, part, step.normal, step.offset, step.farther)
             saved = judge.own_share(two, motions)
             amounts = [float(two.transforms[k, :3, 3].norm()) for k in (part, -1)]
             log.append({"part": part, "amounts": amounts, "standard_errors": step.sure, "own_share": saved})
@@ -245,17 +245,24 @@ def weighed_amounts(
     return motions, log
 
 
-def _in_two(states: list[StateGaussians], motions: PartMotions, part: int, step: Step) -> PartMotions:
-    """The motions with what of a part lies behind the step's plane as a part of its own, the last, each by its own
-    amount."""
+def in_two(
+    states: list[StateGaussians],
+    motions: PartMotions,
+    part: int,
+    normal: Tensor,
+    offset: float,
+    farther: tuple[float, float] = (0.0, 0.0),
+) -> PartMotions:
+    """The motions with what of slide ``part`` lies behind a plane (at the start) as a part of its own, the last; what
+    is before and behind it goes ``farther`` than the part did."""
     T, labels = motions.transforms[part], []
     for s, (state, of) in enumerate(zip(states, motions.labels, strict=True)):
         means = state.gaussians.means.detach().double()
         start = se3.apply(se3.inverse(T).to(means), means) if s else means
-        behind = (of == part + 1) & (start @ step.normal.to(means) >= step.offset)
+        behind = (of == part + 1) & (start @ normal.to(means) >= offset)
         labels.append(torch.where(behind, len(motions) + 1, of))
-    two = motions.with_motion(part, "prismatic", slid_farther(T, step.farther[0]))
-    two = two.with_motion(len(motions), "prismatic", slid_farther(T, step.farther[1]))
+    two = motions.with_motion(part, "prismatic", slid_farther(T, farther[0]))
+    two = two.with_motion(len(motions), "prismatic", slid_farther(T, farther[1]))
     confidence = torch.cat([motions.confidence, motions.confidence[part : part + 1]])
     return replace(two, labels=labels, confidence=confidence)
 

@@ -1,0 +1,97 @@
+"""Drawers side by side that go alike: one motion explains both, and their fronts abut. Behind the fronts are two trays,
+with a gap between them that is narrower than either: a tray that is seen in two pieces, its walls, has a wider one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from p2gs.gaussians.handover import PartMotions, StateGaussians
+from p2gs.motion.directions import axis_of
+from p2gs.motion.discovery.rows import FACING, planes
+from p2gs.ops import se3
+from p2gs.ops.components import TOUCH, components
+from p2gs.parts.bodies import FEWEST
+from p2gs.parts.fronts import Surface, in_two, surfels_of
+from p2gs.visibility.surfels import Surfels
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A gap between two pieces of a part: the plane in its middle, normal [3] and offset along it, at the start; how
+    wide it is, and the pieces on either side (internal units)."""
+
+    normal: Tensor
+    offset: float
+    size: float
+    widths: tuple[float, float]
+
+
+def part_side_by_side(
+    states: list[StateGaussians],
+    surfels: list[Surfels],
+    motions: PartMotions,
+    directions: Tensor,
+    apart: float,
+    limit: int,
+) -> tuple[PartMotions, list[dict]]:
+    """Each slide of which what is behind the front is two trays (``gap_behind``) as two parts with the same motion, up
+    to ``limit`` parts. Whether their fronts are two is for the photographs to say (``join_seamless``).
+
+    directions [D, 3]: of the object; apart: what surfaces tell apart (internal units). Returns the motions and what was
+    split: part, the gap's width and those of the pieces beside it.
+    """
+    log: list[dict] = []
+    part = 0
+    while part < len(motions) < limit:
+        gap = None
+        if motions.types[part] == "prismatic":
+            surfaces, spacing = surfels_of(surfels, states, motions), max(s.spacing for s in surfels)
+            gap = gap_behind(surfaces, motions.transforms[part], part, directions, spacing, apart)
+        if gap is None:
+            part += 1
+            continue
+        log.append({"part": part, "gap": gap.size, "widths": list(gap.widths)})
+        motions = in_two(states, motions, part, gap.normal, gap.offset)
+    return motions, log
+
+
+def gap_behind(
+    surfaces: list[Surface], T: Tensor, part: int, directions: Tensor, spacing: float, apart: float
+) -> Gap | None:
+    """The narrowest gap, along one of ``directions`` [D, 3] across the way of a slide T [4, 4], between two pieces of
+    what is behind the part's front, in both states' surfaces together, that is narrower than both; None without one."""
+    T = T.double().cpu()
+    way, own = axis_of("prismatic", T), [of.labels == part + 1 for of in surfaces]
+    at = [of.points[k] for of, k in zip(surfaces, own, strict=True)]
+    points = torch.cat([at[0], se3.apply(se3.inverse(T), at[1])])
+    facing = (torch.cat([of.normals[k] for of, k in zip(surfaces, own, strict=True)]) @ way).abs() > FACING
+    if int(facing.sum()) < FEWEST:
+        return None
+    front = max(planes(points[facing], way, spacing, apart), key=len)
+    along, reach = points @ way - (points[facing][front] @ way).median(), TOUCH * spacing
+    behind = points[max(along < -reach, along > reach, key=lambda side: int(side.sum()))]
+    pieces = _pieces(behind, reach)
+    across = directions[(directions @ way).abs() < math.sqrt(1 - FACING**2)]
+    gaps = [_gap(a, b, normal) for normal in across for a, b in combinations(pieces, 2)]
+    return min((g for g in gaps if 0 < g.size < min(g.widths)), key=lambda g: g.size, default=None)
+
+
+def _pieces(points: Tensor, reach: float) -> list[Tensor]:
+    """Connected pieces of points [N, 3], those of enough points."""
+    if len(points) < FEWEST:
+        return []
+    piece = components(points, reach)
+    return [points[torch.from_numpy(piece == k)] for k in np.flatnonzero(np.bincount(piece) >= FEWEST)]
+
+
+def _gap(a: Tensor, b: Tensor, normal: Tensor) -> Gap:
+    """Between two pieces [N, 3], [M, 3] along a direction [3]; of negative size where they overlap."""
+    (a_least, a_most), (b_least, b_most) = ((float(u.min()), float(u.max())) for u in (a @ normal, b @ normal))
+    below, above = (a_most, b_least) if a_least < b_least else (b_most, a_least)
+    return Gap(normal, (below + above) / 2, above - below, (a_most - a_least, b_most - b_least))
