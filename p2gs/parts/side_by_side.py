@@ -65,7 +65,9 @@ def gap_behind(
     surfaces: list[Surface], T: Tensor, part: int, directions: Tensor, spacing: float, apart: float
 ) -> Gap | None:
     """The narrowest gap, along one of ``directions`` [D, 3] across the way of a slide T [4, 4], between two pieces of
-    what is behind the part's front, in both states' surfaces together, that is narrower than both; None without one."""
+    what is behind the part's front, in both states' surfaces together: wider than what points of one piece leave
+    between them, narrower than both pieces, and with some of the front on either side in both states. None without
+    one."""
     T = T.double().cpu()
     way, own = axis_of("prismatic", T), [of.labels == part + 1 for of in surfaces]
     at = [of.points[k] for of, k in zip(surfaces, own, strict=True)]
@@ -73,13 +75,22 @@ def gap_behind(
     facing = (torch.cat([of.normals[k] for of, k in zip(surfaces, own, strict=True)]) @ way).abs() > FACING
     if int(facing.sum()) < FEWEST:
         return None
-    front = max(planes(points[facing], way, spacing, apart), key=len)
-    along, reach = points @ way - (points[facing][front] @ way).median(), TOUCH * spacing
+    rows = facing.nonzero().squeeze(1)
+    rows = rows[max(planes(points[rows], way, spacing, apart), key=len)]
+    fronts = [points[rows[rows < len(at[0])]], points[rows[rows >= len(at[0])]]]
+    along, reach = points @ way - (points[rows] @ way).median(), TOUCH * spacing
     behind = points[max(along < -reach, along > reach, key=lambda side: int(side.sum()))]
     pieces = _pieces(behind, reach)
     across = directions[(directions @ way).abs() < math.sqrt(1 - FACING**2)]
     gaps = [_gap(a, b, normal) for normal in across for a, b in combinations(pieces, 2)]
-    return min((g for g in gaps if 0 < g.size < min(g.widths)), key=lambda g: g.size, default=None)
+    gaps = [g for g in gaps if reach < g.size < min(g.widths) and all(_on_both_sides(f, g) for f in fronts)]
+    return min(gaps, key=lambda g: g.size, default=None)
+
+
+def _on_both_sides(front: Tensor, gap: Gap) -> bool:
+    """Whether enough points of a front [N, 3] lie on either side of a gap."""
+    behind = int((front @ gap.normal > gap.offset).sum())
+    return min(behind, len(front) - behind) >= FEWEST
 
 
 def _pieces(points: Tensor, reach: float) -> list[Tensor]:

@@ -24,11 +24,12 @@ def sheet(u: tuple[float, float], v: tuple[float, float], axis: int, at: float) 
     return points, AXES[axis].expand(len(points), 3)
 
 
-def drawers(trays: list[tuple[float, float]], T: torch.Tensor = STILL, opens: bool = True):
-    """One plain front across x, 1 wide (y) and 0.2 high, before bottoms of trays that reach from y to y: nothing but
-    the front shows while they are shut. The world is placed by T. opens: shut at the start, else at the end."""
+def drawers(trays: list[tuple[float, ...]], T: torch.Tensor = STILL, opens: bool = True):
+    """One plain front across x, 1 wide (y) and 0.2 high, before bottoms of trays that reach from y to y (and lie at z):
+    nothing but the front shows while they are shut. The world is placed by T. opens: shut at the start, else at the
+    end."""
     front = sheet((0.0, 1.0), (0.0, 0.2), 0, 0.0)
-    behind = [sheet((-0.4, -0.02), tray, 2, 0.02) for tray in trays]
+    behind = [sheet((-0.4, -0.02), (least, most), 2, *(z or [0.02])) for least, most, *z in trays]
     surfels, states, labels = [], [], []
     for s in (0, 1):
         shut = s == (0 if opens else 1)
@@ -74,6 +75,7 @@ def test_two_trays_behind_one_front_are_two_parts(T, opens):
         [(0.04, 0.96)],  # one
         [(0.0, 0.06), (0.94, 1.0)],  # the rims of one of which the bottom is not seen
         [(0.04, 0.3), (0.66, 0.96)],  # a gap wider than the pieces
+        [(0.04, 0.49, 0.02), (0.51, 0.96, 0.15)],  # apart only in height, where they are not parted from end to end
         [],
     ],
 )
@@ -97,3 +99,14 @@ def test_turns_and_directions_along_the_way_are_not_asked():
     assert gap_behind(surfaces, motions.transforms[0], 0, AXES[:0], SPACING, APART) is None
     motions.types[0] = "revolute"
     assert part_side_by_side(states, surfels, motions, AXES, APART, 5) == (motions, [])
+
+
+@pytest.mark.parametrize("state", [0, 1])
+def test_a_tray_without_a_front_is_no_drawer(state):
+    states, surfels, motions = drawers([(0.04, 0.44), (0.56, 0.96)])
+    surfaces = surfels_of(surfels, states, motions)
+    asked = {"T": motions.transforms[0], "part": 0, "directions": AXES, "spacing": SPACING, "apart": APART}
+    assert gap_behind(surfaces, **asked) is not None
+    across = (surfaces[state].normals[:, 0].abs() > 0.9) & (surfaces[state].points[:, 1] > 0.5)
+    surfaces[state].labels[across] = 0
+    assert gap_behind(surfaces, **asked) is None
