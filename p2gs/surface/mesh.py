@@ -15,6 +15,7 @@ from p2gs.gaussians.twin_json import load_twin
 from p2gs.gaussians.views import NamedCamera, orbit, read_cameras
 from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.bridges import bridged
 from p2gs.surface.closed import close
 from p2gs.surface.pieces import join_pieces
 from p2gs.surface.protocol import largest_clusters, separate_whole, surface_options
@@ -80,13 +81,14 @@ def _added(shown: Mesh, done: Mesh) -> np.ndarray:
 def completed(obj: ArticulatedObject, seen: Sightings, shown: Sequence[Mesh]) -> list[Mesh]:
     """The parts' surfaces as ``shown``, open, with guesses for what nobody saw.
 
-    The base's underside and other sides that no camera saw are closed (``close_unseen_sides``), drawers completed
-    (``complete_tray``), with nothing of the base left in their way (``clear_way``) or of other parts on them
-    (``not_the_trays``), and pieces of what slides joined (``join_pieces``).
+    Pieces that hang apart are joined to their part (``bridged``). The base's underside and other sides that no camera
+    saw are closed (``close_unseen_sides``), drawers completed (``complete_tray``), with nothing of the base left in
+    their way (``clear_way``) or of other parts on them (``not_the_trays``), and pieces of what slides joined
+    (``join_pieces``).
     """
     voxel, meshes = seen.voxel, []
     for k, part in enumerate(obj.parts):
-        mesh = shown[k]
+        mesh = bridged(shown[k], seen.views, seen.poses[k], voxel)
         if part.joint is None:
             mesh = close_unseen_sides(mesh, seen.views, seen.poses[k], k, voxel, TRUNCATION * voxel)
         meshes.append(mesh)

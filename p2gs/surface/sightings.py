@@ -13,8 +13,9 @@ from p2gs.gaussians.paint import draw
 from p2gs.gaussians.pose import part_transform, pose
 from p2gs.gaussians.views import bounds
 from p2gs.ops.blend import likeliest
-from p2gs.ops.mesh import Mesh, largest_components
+from p2gs.ops.mesh import Mesh
 from p2gs.render.base import MAX_FEATURES
+from p2gs.surface.bridges import without_crumbs
 from p2gs.surface.depth_view import DepthView, add_normals
 from p2gs.surface.surface_depth import surface_depth
 from p2gs.surface.trays import Tray, find_tray
@@ -107,9 +108,9 @@ class Sightings:
     poses: list[list[Tensor]]
 
     def surface(self, k: int) -> Mesh:
-        """What was seen of the k-th part, in the start state."""
+        """What was seen of the k-th part, in the start state, without crumbs."""
         mesh = fuse(self.views, self.poses[k], k, self.voxel, trunc=TRUNCATION * self.voxel, behind=BEHIND * self.voxel)
-        return largest_components(mesh)
+        return without_crumbs(mesh, self.views, self.poses[k], self.voxel)
 
     def tray(self, k: int, mesh: Mesh, body: Mesh) -> Optional[Tray]:
         """``find_tray`` for the k-th part, which slides, of which ``mesh`` was seen."""

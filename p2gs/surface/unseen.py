@@ -119,16 +119,16 @@ def grid_plane(points: np.ndarray, area: np.ndarray, colours: np.ndarray, sign: 
     return Mesh(points, faces, colours).without_unused()
 
 
-def _open_vertices(faces: np.ndarray) -> np.ndarray:
-    """Indices of the vertices on edges that only one triangle has."""
+def open_edges(faces: np.ndarray) -> np.ndarray:
+    """Edges [E, 2] that only one triangle has, each with its lower vertex first."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     first, which = unique_rows(edges)
-    return np.unique(edges[first[np.bincount(which) == 1]])
+    return edges[first[np.bincount(which) == 1]]
 
 
 def sewn(mesh: Mesh, plane: Mesh, reach: float) -> Mesh:
     """Both as one; the plane's rim takes the vertices of the mesh's open edges where these are within ``reach``."""
-    rim, edge = _open_vertices(plane.faces), _open_vertices(mesh.faces)
+    rim, edge = np.unique(open_edges(plane.faces)), np.unique(open_edges(mesh.faces))
     index = np.arange(len(plane.vertices)) + len(mesh.vertices)
     if len(rim) and len(edge):
         distance, nearest = search_tree(mesh.vertices[edge]).query(plane.vertices[rim])

@@ -1,0 +1,100 @@
+"""A part is one body: pieces of its surface that hang apart are joined where nobody saw that nothing is between them.
+
+A table's leg ends under its top, where no camera looks. What was seen of it is a piece of its own, and is neither to be
+lost with the crumbs nor to float. Photographs need it: there is nothing behind it. Behind a false surface that hangs in
+an opening there is the inside.
+"""
+
+from __future__ import annotations
+
+from typing import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from p2gs.ops.knn import search_tree
+from p2gs.ops.mesh import Mesh, components
+from p2gs.surface.depth_view import DepthView, pixel_matrix, pixels
+from p2gs.surface.faces import Faces
+from p2gs.surface.unseen import NEAR, eyes_of, open_edges, seen_empty
+
+OUT = 1.5  # voxels by which what is added may stand out of what hides it
+LOOKS, POINTS = 32, 64  # views, and points of a piece, that are looked at
+ENOUGH = 3  # views that see nothing behind a piece
+
+
+def without_crumbs(
+    mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float, share: float = 0.1
+) -> Mesh:
+    """The connected pieces of at least ``share`` of the largest one's triangles, and smaller ones that photographs need
+    (``before_nothing``), but for crumbs that a bridge could cover.
+
+    views, poses ([4, 4] each), voxel: as in ``close_unseen_sides``.
+    """
+    if not len(mesh.faces):
+        return mesh
+    label = components(mesh)
+    count, area = np.bincount(label), np.bincount(label, Faces(mesh).area)
+    kept = count >= share * count.max()
+    for k in np.flatnonzero(~kept & (area > (2 * NEAR * voxel) ** 2)):
+        kept[k] = before_nothing(mesh.only(label == k), mesh, views, poses, voxel)
+    return mesh.only(kept[label])
+
+
+def before_nothing(piece: Mesh, mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float) -> bool:
+    """Whether ``ENOUGH`` views see most of what they see of a piece before space that is seen empty, to the end of the
+    ``mesh`` of its part."""
+    looked = np.unique(np.linspace(0, len(views) - 1, min(LOOKS, len(views))).round().astype(int))
+    middles = piece.vertices[piece.faces].mean(1)
+    points = torch.as_tensor(middles[np.linspace(0, len(middles) - 1, min(POINTS, len(middles))).astype(int)])
+    lo, hi = (torch.as_tensor(f(mesh.vertices, axis=0)) for f in (np.min, np.max))
+    steps = torch.arange(2 * NEAR * voxel, float((hi - lo).norm()), NEAR * voxel, dtype=torch.float64)
+    enough = 0
+    for i, eye in zip(looked, eyes_of([views[i] for i in looked], [poses[i] for i in looked]), strict=True):
+        view = views[i]
+        z, pixel = pixels(points.T.contiguous(), pixel_matrix(view.camera, poses[i]).to(points), view.camera)
+        depth = torch.cat([view.depth.reshape(-1), view.depth.new_zeros(1)])[pixel]
+        shown = points[(depth - z).abs() < NEAR * voxel]
+        if not len(shown):
+            continue
+        behind = shown[:, None] + steps[:, None] * torch.nn.functional.normalize(shown - eye, dim=1)[:, None]
+        within = ((behind > lo) & (behind < hi)).all(-1)
+        empty = ~within
+        empty[within] = seen_empty(behind[within], views, poses, OUT * voxel)
+        enough += int(float(empty.all(1).double().mean()) > 0.5)
+    return enough >= ENOUGH
+
+
+def bridged(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float) -> Mesh:
+    """The mesh with its pieces joined to the largest one, in the order of their size, where they are near to it and
+    nobody saw that nothing is between. The triangles that are added come last."""
+    if not len(mesh.faces):
+        return mesh
+    label, added = components(mesh), []
+    order = np.argsort(-np.bincount(label), kind="stable")
+    rows = [np.unique(mesh.faces[label == k]) for k in order]
+    body = rows[0]
+    for k, row in zip(order[1:], rows[1:], strict=True):
+        piece, rest = mesh.only(label == k), Mesh(mesh.vertices[body], np.zeros((0, 3), np.int64))
+        faces = _bridge(piece, rest, views, poses, voxel)
+        own = faces < len(row)  # vertices of the piece come first
+        added.append(np.where(own, row[np.where(own, faces, 0)], body[np.where(own, 0, faces - len(row))]))
+        body = np.concatenate([body, row])
+    return Mesh(mesh.vertices, np.concatenate([mesh.faces, *added]), mesh.colours)
+
+
+def _bridge(piece: Mesh, body: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float) -> np.ndarray:
+    """Triangles [F, 3] from a piece's open edges to the vertices of ``body`` nearest to them, of which the numbers go
+    on from the piece's: within ``NEAR``, and unseen."""
+    edges = open_edges(piece.faces)
+    if not len(edges) or not len(body.vertices):
+        return np.zeros((0, 3), np.int64)
+    distance, nearest = search_tree(body.vertices).query(piece.vertices[edges])
+    there = nearest + len(piece.vertices)
+    a, b, c, d = edges[:, 0], edges[:, 1], there[:, 1], there[:, 0]
+    near = (distance < NEAR * voxel).all(1)
+    middle = (piece.vertices[edges] + body.vertices[nearest]).mean(1) / 2
+    near[near] = ~seen_empty(torch.as_tensor(middle[near]), views, poses, OUT * voxel).numpy()
+    faces = np.concatenate([np.stack(t, 1)[near] for t in ((a, b, c), (a, c, d))])
+    return faces[faces[:, 1] != faces[:, 2]]
