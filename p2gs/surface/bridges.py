@@ -20,6 +20,7 @@ from p2gs.surface.faces import Faces
 from p2gs.surface.unseen import NEAR, eyes_of, open_edges, seen_empty
 
 OUT = 1.5  # voxels by which what is added may stand out of what hides it
+STOPS = (0.25, 0.5, 0.75)  # where it is looked at along a bridge
 LOOKS, POINTS = 32, 64  # views, and points of a piece, that are looked at
 ENOUGH = 3  # views that see nothing behind a piece
 
@@ -67,8 +68,9 @@ def before_nothing(piece: Mesh, mesh: Mesh, views: Sequence[DepthView], poses: S
 
 
 def bridged(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float) -> Mesh:
-    """The mesh with its pieces joined to the largest one, in the order of their size, where they are near to it and
-    nobody saw that nothing is between. The triangles that are added come last."""
+    """The mesh with its pieces joined to the largest one, in the order of their size: the open end of each goes on as
+    it is, along one of the axes, to where it meets the others, if nobody saw that nothing is there. The triangles that
+    are added come last."""
     if not len(mesh.faces):
         return mesh
     label, added = components(mesh), []
@@ -76,25 +78,44 @@ def bridged(mesh: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], vox
     rows = [np.unique(mesh.faces[label == k]) for k in order]
     body = rows[0]
     for k, row in zip(order[1:], rows[1:], strict=True):
-        piece, rest = mesh.only(label == k), Mesh(mesh.vertices[body], np.zeros((0, 3), np.int64))
-        faces = _bridge(piece, rest, views, poses, voxel)
-        own = faces < len(row)  # vertices of the piece come first
-        added.append(np.where(own, row[np.where(own, faces, 0)], body[np.where(own, 0, faces - len(row))]))
+        faces = bridge(mesh.only(label == k), mesh.vertices[body], views, poses, voxel)
+        added.append(np.concatenate([row, body])[faces])  # the piece's vertices come first
         body = np.concatenate([body, row])
     return Mesh(mesh.vertices, np.concatenate([mesh.faces, *added]), mesh.colours)
 
 
-def _bridge(piece: Mesh, body: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float) -> np.ndarray:
-    """Triangles [F, 3] from a piece's open edges to the vertices of ``body`` nearest to them, of which the numbers go
-    on from the piece's: within ``NEAR``, and unseen."""
-    edges = open_edges(piece.faces)
-    if not len(edges) or not len(body.vertices):
-        return np.zeros((0, 3), np.int64)
-    distance, nearest = search_tree(body.vertices).query(piece.vertices[edges])
-    there = nearest + len(piece.vertices)
-    a, b, c, d = edges[:, 0], edges[:, 1], there[:, 1], there[:, 0]
-    near = (distance < NEAR * voxel).all(1)
-    middle = (piece.vertices[edges] + body.vertices[nearest]).mean(1) / 2
-    near[near] = ~seen_empty(torch.as_tensor(middle[near]), views, poses, OUT * voxel).numpy()
-    faces = np.concatenate([np.stack(t, 1)[near] for t in ((a, b, c), (a, c, d))])
-    return faces[faces[:, 1] != faces[:, 2]]
+def bridge(
+    piece: Mesh, body: np.ndarray, views: Sequence[DepthView], poses: Sequence[Tensor], voxel: float
+) -> np.ndarray:
+    """Triangles [F, 3] from a piece's open edges to the points of ``body`` [N, 3] that they meet along an axis, whose
+    numbers go on from the piece's vertices: of the six ways the shortest that nobody saw through, and what is longer by
+    ``NEAR`` at most."""
+    edges, best = open_edges(piece.faces), (np.inf, np.zeros((0, 3), np.int64))
+    reach = float(np.ptp(body, axis=0).max()) if len(body) else 0.0
+    for way in (*np.eye(3), *-np.eye(3)) if len(edges) else ():
+        length, met = _meets(piece.vertices[edges], way, body, voxel, reach)
+        rows = np.flatnonzero(np.isfinite(length).all(1))
+        stops = piece.vertices[edges[rows]] + np.array(STOPS)[:, None, None, None] * length[rows, :, None] * way
+        empty = seen_empty(torch.as_tensor(stops.reshape(-1, 3)), views, poses, OUT * voxel).numpy()
+        rows = rows[~empty.reshape(len(STOPS), len(rows), 2).any((0, 2))]
+        if not len(rows) or (least := length[rows].min()) >= best[0]:
+            continue
+        rows = rows[length[rows].max(1) < least + NEAR * voxel]
+        (a, b), (d, c) = edges[rows].T, met[rows].T + len(piece.vertices)
+        faces = np.concatenate([np.stack(t, 1) for t in ((a, b, c), (a, c, d))])
+        best = min(best, (least, faces[faces[:, 1] != faces[:, 2]]), key=lambda found: found[0])
+    return best[1]
+
+
+def _meets(
+    ends: np.ndarray, way: np.ndarray, body: np.ndarray, voxel: float, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far points [E, 2, 3] go along ``way`` [3] until a point of ``body`` [N, 3] is within ``OUT`` voxels, up to
+    ``reach`` (inf: it never is), and which, [E, 2] each."""
+    tree, length, met = search_tree(body), np.full(ends.shape[:2], np.inf), np.zeros(ends.shape[:2], np.int64)
+    for far in np.arange(0.0, reach, voxel):
+        left = np.isinf(length)
+        distance, nearest = tree.query(ends[left] + far * way)
+        hit = distance < OUT * voxel
+        length[left], met[left] = np.where(hit, far, np.inf), nearest
+    return length, met
