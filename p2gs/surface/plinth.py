@@ -17,7 +17,7 @@ HEIGHT = (0.1, 0.3)  # of a plinth, in the whole height: toes fit in, a table's 
 STEP = 0.05  # of the whole height by which the body stands out over it
 STRAIGHT = 2.0  # voxels from their median within which levels below the step lie
 LEAST = 8  # voxels of height
-MOST = 0.6  # share of the levels below the step that must
+MOST = 0.5  # share of the levels below the step that must
 ABOVE = 6  # levels over the step that stand out
 
 
