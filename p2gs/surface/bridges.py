@@ -91,9 +91,9 @@ def bridge(
     numbers go on from the piece's vertices: of the six ways the shortest that nobody saw through, and what is longer by
     ``NEAR`` at most."""
     edges, best = open_edges(piece.faces), (np.inf, np.zeros((0, 3), np.int64))
-    reach = float(np.ptp(body, axis=0).max()) if len(body) else 0.0
-    for way in (*np.eye(3), *-np.eye(3)) if len(edges) else ():
-        length, met = _meets(piece.vertices[edges], way, body, voxel, reach)
+    reach = float(np.ptp(piece.vertices, axis=0).max())  # no bridge is longer than what it holds
+    for way in (*np.eye(3), *-np.eye(3)) if len(edges) and len(body) else ():
+        length, met = _meets(piece.vertices[edges], way, body, voxel, min(reach, best[0] + NEAR * voxel))
         rows = np.flatnonzero(np.isfinite(length).all(1))
         stops = piece.vertices[edges[rows]] + np.array(STOPS)[:, None, None, None] * length[rows, :, None] * way
         empty = seen_empty(torch.as_tensor(stops.reshape(-1, 3)), views, poses, OUT * voxel).numpy()
@@ -115,7 +115,7 @@ def _meets(
     tree, length, met = search_tree(body), np.full(ends.shape[:2], np.inf), np.zeros(ends.shape[:2], np.int64)
     for far in np.arange(0.0, reach, voxel):
         left = np.isinf(length)
-        distance, nearest = tree.query(ends[left] + far * way)
-        hit = distance < OUT * voxel
-        length[left], met[left] = np.where(hit, far, np.inf), nearest
+        distance, nearest = tree.query(ends[left] + far * way, distance_upper_bound=OUT * voxel)
+        length[left] = np.where(np.isfinite(distance), far, np.inf)
+        met[left] = np.where(np.isfinite(distance), nearest, 0)
     return length, met
