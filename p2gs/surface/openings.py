@@ -48,7 +48,7 @@ class OpeningsConfig:
     boards: whether flat boards inside (shelves, partitions, bottoms of drawers) are looked for, before which walls are
     not seen.
     patch: Gaussians a patch. looks, checks: views of a state from which rays are cast, and by which patches are judged;
-    size: their long edge in pixels. apart: surfaces that the other state shows within this are confirmed by it; cell:
+    size: their long edge in pixels. apart: surfaces of a part that the other state shows within this confirm it; cell:
     grid of the walls; wall: their thickness (all internal units).
     """
 
@@ -79,14 +79,25 @@ class Opening:
 
 
 def unconfirmed(
-    g: GaussianTensors, labels: Tensor, transforms: Tensor, other: GaussianTensors, stack: DepthStack, apart: float
+    g: GaussianTensors,
+    labels: Tensor,
+    transforms: Tensor,
+    other: GaussianTensors,
+    other_labels: Tensor,
+    stack: DepthStack,
+    apart: float,
 ) -> Tensor:
     """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its
-    views see, and farther than ``apart`` from its surfaces.  transforms [K-1, 4, 4] to the other state; stack: its
+    views see, and farther than ``apart`` from surfaces of their own part (what hangs where a door shuts is not the
+    door's).  transforms [K-1, 4, 4] to the other state; labels [N], other_labels [M]: of both; stack: the other one's
     rendered depth."""
-    at = landed(g.means, labels, transforms)
-    solid = torch.sigmoid(other.opacity_logits) > SOLID
-    return out_of_sight(at, stack) & (knn(other.means[solid], at, 1, False)[0][:, 0] > apart)
+    at, solid = landed(g.means, labels, transforms), torch.sigmoid(other.opacity_logits) > SOLID
+    far = torch.ones(len(g), dtype=torch.bool)
+    for part in labels.unique().tolist():
+        mine, theirs = (labels == part).nonzero().squeeze(1), other.means[solid & (other_labels == part)]
+        if len(theirs):
+            far[mine] = knn(theirs, at[mine], 1, False)[0][:, 0] > apart
+    return out_of_sight(at, stack) & far
 
 
 BASE, DOOR, DRAWER = range(3)
@@ -295,7 +306,10 @@ def open_up(
     out = [Opening(torch.ones(len(x), dtype=torch.bool), x[:0]) for x in g]
     if min(int(k.sum()) for k in solid) < config.patch:  # no object: fusion says so
         return out, motions, stacks, counted
-    lids = [unconfirmed(g[s], motions.labels[s], away[s], g[1 - s], stacks[1 - s], config.apart) for s in (0, 1)]
+    lids = [
+        unconfirmed(g[s], motions.labels[s], away[s], g[1 - s], motions.labels[1 - s], stacks[1 - s], config.apart)
+        for s in (0, 1)
+    ]
     base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
     box = torch.quantile(
         torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0

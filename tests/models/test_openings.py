@@ -181,15 +181,21 @@ def test_states_without_an_object_are_left_to_fusion():
     assert all(o.kept.all() for o in out) and told is motions and all(c["removed"] == 0 for c in counted)
 
 
-def test_unconfirmed_is_what_is_hidden_and_far_from_what_the_other_state_shows():
+def test_unconfirmed_is_what_is_hidden_and_far_from_what_the_other_state_shows_of_its_part():
     lid = panel([-0.37, 0.2, -0.27], [0.74, 0, 0], [0, 0, 0.54], DARK)
     states, motions, _, stacks = scene(lid, [lid])
-    g, n = states[1].gaussians, len(lid)
-    found = unconfirmed(g, motions.labels[1], se3.inverse(motions.transforms), states[0].gaussians, stacks[0], 0.035)
+    (other, g), n = (s.gaussians for s in states), len(lid)
+
+    def asked(apart: float, labels: torch.Tensor) -> torch.Tensor:
+        away = se3.inverse(motions.transforms)
+        return unconfirmed(g, motions.labels[1], away, other, labels, stacks[0], apart)
+
+    found = asked(0.035, motions.labels[0])
     inner = (lid.means[:, [0, 2]].abs() < torch.tensor([0.33, 0.23])).all(1)  # its rim is beside the sides
     assert found[-n:][inner].all() and found[: len(g) - n].float().mean() < 0.02
-    near = unconfirmed(g, motions.labels[1], se3.inverse(motions.transforms), states[0].gaussians, stacks[0], 0.5)
-    assert not near.any()  # the shut door is within 0.5 of the lid
+    assert not asked(0.5, motions.labels[0]).any()  # the sides are within 0.5 of the lid
+    doors = asked(0.5, torch.ones_like(motions.labels[0]))  # so is the shut door, which it does not belong to
+    assert doors[-n:][inner].all() and not doors[motions.labels[1] == 1].any()
 
 
 def test_walls_are_met_where_they_stand_and_at_the_box():
