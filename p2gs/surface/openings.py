@@ -33,6 +33,7 @@ SOLID = 0.3  # opacity from which a Gaussian is surface
 # share of the most Gaussians that any backdrop lets give way from which on backdrops are held against the photographs
 ALIKE = 0.9
 APART = 0.25  # share of a part's largest piece below which another one is apart from it
+LEVEL = 1 / 255  # of a photograph's brightness: less than this it does not tell
 COVER = 5.0  # pixels, all checked views together, that a patch must cover to be judged
 
 
@@ -86,18 +87,21 @@ def unconfirmed(
     other_labels: Tensor,
     stack: DepthStack,
     apart: float,
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its
     views see, and farther than ``apart`` from surfaces of their own part (what hangs where a door shuts is not the
-    door's).  transforms [K-1, 4, 4] to the other state; labels [N], other_labels [M]: of both; stack: the other one's
-    rendered depth."""
+    door's). And which of these are near another part's, [N] bool.
+
+    transforms [K-1, 4, 4] to the other state; labels [N], other_labels [M]: of both; stack: the other one's rendered
+    depth."""
     at, solid = landed(g.means, labels, transforms), torch.sigmoid(other.opacity_logits) > SOLID
-    far = torch.ones(len(g), dtype=torch.bool)
+    own = torch.full((len(g),), torch.inf)
     for part in labels.unique().tolist():
         mine, theirs = (labels == part).nonzero().squeeze(1), other.means[solid & (other_labels == part)]
         if len(theirs):
-            far[mine] = knn(theirs, at[mine], 1, False)[0][:, 0] > apart
-    return out_of_sight(at, stack) & far
+            own[mine] = knn(theirs, at[mine], 1, False)[0][:, 0]
+    lids = out_of_sight(at, stack) & (own > apart)
+    return lids, lids & (knn(other.means[solid], at, 1, False)[0][:, 0] <= apart)
 
 
 BASE, DOOR, DRAWER = range(3)
@@ -114,10 +118,19 @@ def kinds(g: GaussianTensors, labels: Tensor, types: list[str]) -> Tensor:
 
 
 class OneState:
-    """One state's lids and what is behind them: g its Gaussians; lids [N] bool; kind [N]: see ``kinds``."""
+    """One state's lids and what is behind them: g its Gaussians; lids, and those ``beside`` another part's surface [N]
+    bool; kind [N]: see ``kinds``."""
 
     def __init__(
-        self, g: GaussianTensors, lids: Tensor, kind: Tensor, views, config: OpeningsConfig, backend: str, device
+        self,
+        g: GaussianTensors,
+        lids: Tensor,
+        beside: Tensor,
+        kind: Tensor,
+        views,
+        config: OpeningsConfig,
+        backend: str,
+        device,
     ):
         self.g, self.views, self.config, self.backend, self.device = g, views, config, backend, device
         self.rows = lids.nonzero().squeeze(1)
@@ -127,6 +140,9 @@ class OneState:
             (self.patch, kind[self.rows]), torch.ones(len(self.rows)), accumulate=True
         )
         self.allowed = torch.tensor([config.may_lose, config.doors, config.drawers])[votes.argmax(1)]
+        close = torch.zeros(self.count).index_add_(0, self.patch, beside[self.rows].float())
+        # a bar between two doors is beside them when they are shut: it must not be explained worse
+        self.allowed = torch.where(close > votes.sum(1) / 2, self.allowed.clamp_max(1.0), self.allowed)
         self.level = min(range(len(views.levels)), key=lambda i: abs(views.levels[i] - config.size))
 
     def render(self, g: GaussianTensors, camera, background: Tensor, features: Tensor | None = None):
@@ -220,7 +236,8 @@ class OneState:
                 [(x - s.image).abs().sum(-1)[p] for x, s, p in zip(pictures, shots, pixels, strict=True)]
             )
 
-        cover, was = weight.sum(1), over_patches(self.g)
+        cover = weight.sum(1)
+        was = over_patches(self.g).clamp_min(3 * LEVEL * cover)
 
         def giving_way(backdrop: Backdrop) -> Tensor:
             def worse(chosen: Tensor, allowed: Tensor) -> Tensor:
@@ -306,10 +323,11 @@ def open_up(
     out = [Opening(torch.ones(len(x), dtype=torch.bool), x[:0]) for x in g]
     if min(int(k.sum()) for k in solid) < config.patch:  # no object: fusion says so
         return out, motions, stacks, counted
-    lids = [
+    found = [
         unconfirmed(g[s], motions.labels[s], away[s], g[1 - s], motions.labels[1 - s], stacks[1 - s], config.apart)
         for s in (0, 1)
     ]
+    lids, beside = [of[0] for of in found], [of[1] for of in found]
     base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
     box = torch.quantile(
         torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0
@@ -320,9 +338,8 @@ def open_up(
         counted[s]["unconfirmed"] = int(lids[s].sum())
         if int((lids[s] & solid[s]).sum()) < config.patch:
             continue
-        state = OneState(
-            g[s], lids[s], kinds(g[s], motions.labels[s], motions.types), views[s], config, backend, device
-        )
+        kind = kinds(g[s], motions.labels[s], motions.types)
+        state = OneState(g[s], lids[s], beside[s], kind, views[s], config, backend, device)
         chosen, backdrop = state.choose(state.backdrops(walls, stacks))
         counted[s] |= {"patches": state.count, "boards": backdrop.boards, "gave_way": int(chosen.sum())}
         if not chosen.any():

@@ -112,7 +112,9 @@ def test_a_backdrop_has_the_shelf_that_only_the_photographs_know(monkeypatch):
     walls = Walls(outside, outside.amin(0), outside.amax(0), 0.02)
 
     def on_shelf(config):
-        state = OneState(g, lids, torch.zeros(len(g), dtype=torch.int64), views[1], config, "auto", "cpu")
+        state = OneState(
+            g, lids, torch.zeros_like(lids), torch.zeros(len(g), dtype=torch.int64), views[1], config, "auto", "cpu"
+        )
         points = [b.points for b in state.backdrops(walls, stacks)]
         return [
             int((((p - torch.tensor([0.0, -0.05, -0.04])).abs() < torch.tensor([0.3, 0.15, 0.02])).all(1)).sum())

@@ -190,12 +190,14 @@ def test_unconfirmed_is_what_is_hidden_and_far_from_what_the_other_state_shows_o
         away = se3.inverse(motions.transforms)
         return unconfirmed(g, motions.labels[1], away, other, labels, stacks[0], apart)
 
-    found = asked(0.035, motions.labels[0])
+    found, beside = asked(0.035, motions.labels[0])
+    assert not beside.any()
     inner = (lid.means[:, [0, 2]].abs() < torch.tensor([0.33, 0.23])).all(1)  # its rim is beside the sides
     assert found[-n:][inner].all() and found[: len(g) - n].float().mean() < 0.02
-    assert not asked(0.5, motions.labels[0]).any()  # the sides are within 0.5 of the lid
-    doors = asked(0.5, torch.ones_like(motions.labels[0]))  # so is the shut door, which it does not belong to
+    assert not asked(0.5, motions.labels[0])[0].any()  # the sides are within 0.5 of the lid
+    doors, beside = asked(0.5, torch.ones_like(motions.labels[0]))  # so is the shut door, which it does not belong to
     assert doors[-n:][inner].all() and not doors[motions.labels[1] == 1].any()
+    assert torch.equal(beside, doors)
 
 
 def test_walls_are_met_where_they_stand_and_at_the_box():
