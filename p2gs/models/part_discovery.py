@@ -70,16 +70,7 @@ def find_part_motions(
         expanded += later
     say("settling labels and motions")
     motions, rounds = settle_labels(judge, motions, config)
-    motions, joined = join_twins(states, motions, found.problem.scale.apart)
-    if joined:
-        motions = judge.refine(motions)
-    surfels, apart = found.problem.surfels, found.problem.scale.apart
-    faced = directions_of(states, motions) if "prismatic" in motions.types else torch.zeros(0, 3).double()
-    motions, beside = part_side_by_side(states, surfels, motions, faced, apart, limit)
-    if beside:
-        motions = judge.improved(motions)[2]
-    motions, seamless = join_seamless(judge, motions)
-    motions, fronts = part_fronts(judge, sharpened or states, surfels, motions, faced, apart, limit)
+    motions, neighbours = _neighbours(judge, found, motions, sharpened or states, limit)
     motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
     motions, _, laid = lay_axes(judge, motions, config.askew, config.part_penalty)
     for part in unfounded:
@@ -96,10 +87,7 @@ def find_part_motions(
         "expanded": expanded,
         **improved,
         "rounds": rounds,
-        "joined": joined,
-        "side_by_side": beside,
-        "seamless": seamless,
-        "fronts": fronts,
+        **neighbours,
         "unfounded": unfounded,
         "laid": laid,
         **_plain(found.diagnostics),
@@ -179,6 +167,23 @@ def _improved(
             motions, bodies = _bodies(judge, motions, limit)
             changed += bodies
     return motions, {"shifted": shifted, "reconsidered": changed}
+
+
+def _neighbours(
+    judge: Judge, found: Discovery, motions: PartMotions, sharpened: list[StateGaussians], limit: int
+) -> tuple[PartMotions, dict]:
+    """Parts that touch and go alike as one where they are one body, as two where they are two; what was done."""
+    states, surfels, apart = judge.states, found.problem.surfels, found.problem.scale.apart
+    motions, joined = join_twins(states, motions, apart)
+    if joined:
+        motions = judge.refine(motions)
+    faced = directions_of(states, motions) if "prismatic" in motions.types else torch.zeros(0, 3).double()
+    motions, beside = part_side_by_side(states, surfels, motions, faced, apart, limit)
+    if beside:
+        motions = judge.improved(motions)[2]
+    motions, seamless = join_seamless(judge, motions)
+    motions, fronts = part_fronts(judge, sharpened, surfels, motions, faced, apart, limit)
+    return motions, {"joined": joined, "side_by_side": beside, "seamless": seamless, "fronts": fronts}
 
 
 def _bodies(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMotions, list[dict]]:

@@ -17,9 +17,9 @@ from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh, components
 from p2gs.surface.depth_view import DepthView, pixel_matrix, pixels
 from p2gs.surface.faces import Faces
+from p2gs.surface.pieces import OUT
 from p2gs.surface.unseen import NEAR, eyes_of, open_edges, seen_empty
 
-OUT = 1.5  # voxels by which what is added may stand out of what hides it
 STOPS = (0.25, 0.5, 0.75)  # where it is looked at along a bridge
 LOOKS, POINTS = 32, 64  # views, and points of a piece, that are looked at
 ENOUGH = 3  # views that see nothing behind a piece
@@ -102,7 +102,7 @@ def bridge(
             continue
         rows = rows[length[rows].max(1) < least + NEAR * voxel]
         (a, b), (d, c) = edges[rows].T, met[rows].T + len(piece.vertices)
-        faces = np.concatenate([np.stack(t, 1) for t in ((a, b, c), (a, c, d))])
+        faces = np.concatenate([np.stack(t, 1) for t in ((b, a, d), (b, d, c))])  # round as the piece's are
         best = min(best, (least, faces[faces[:, 1] != faces[:, 2]]), key=lambda found: found[0])
     return best[1]
 

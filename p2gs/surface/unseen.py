@@ -120,9 +120,9 @@ def grid_plane(points: np.ndarray, area: np.ndarray, colours: np.ndarray, sign: 
 
 
 def open_edges(faces: np.ndarray) -> np.ndarray:
-    """Edges [E, 2] that only one triangle has, each with its lower vertex first."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    first, which = unique_rows(edges)
+    """Edges [E, 2] that only one triangle has, each in the direction in which that triangle goes round."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    first, which = unique_rows(np.sort(edges, axis=1))
     return edges[first[np.bincount(which) == 1]]
 
 

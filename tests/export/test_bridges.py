@@ -40,6 +40,11 @@ def test_a_leg_that_ends_out_of_sight_stays_and_is_joined():
     added = whole.vertices[whole.faces[len(kept.faces) :]]
     assert 0.2 < added[..., 2].min() and added[..., 2].max() < 0.3 + 0.06 + VOXEL  # from the leg's end to the top
     assert np.ptp(added[..., :2], axis=1).max() < 3 * VOXEL  # straight up
+    label = components(kept)
+    legs = np.unique(kept.faces[label == np.bincount(label).argmin()])
+    edges = np.concatenate([whole.faces[:, [i, (i + 1) % 3]] for i in range(3)])
+    edges = edges[np.isin(edges, legs).all(1)]
+    assert len(np.unique(edges, axis=0)) == len(edges)  # what is added goes round as its neighbours do
 
 
 def test_a_sheet_in_an_opening_is_a_crumb():
