@@ -82,6 +82,11 @@ def surfels_of(surfels: list[Surfels], states: list[StateGaussians], motions: Pa
     return out
 
 
+def across(directions: Tensor, way: Tensor) -> Tensor:
+    """Those of ``directions`` [D, 3] in which a surface across a slide's ``way`` [3] extends."""
+    return directions[(directions @ way).abs() < math.sqrt(1 - FACING**2)]
+
+
 def front_of(surfaces: list[Surface], T: Tensor, part: int, state: int, reach: float) -> Front:
     """What of slide ``part``, of motion T [4, 4], stands across its way in ``state`` and finds such a surface of it in
     the other state: the nearest, where a surface along the way by ``reach`` is as near as one beside it by as much as
@@ -210,7 +215,7 @@ def _step_of(
     if motions.types[part] != "prismatic":
         return None
     T, reach = motions.transforms[part], judge.config.free_moving
-    along = directions[(directions @ axis_of("prismatic", T)).abs() < math.sqrt(1 - FACING**2)]
+    along = across(directions, axis_of("prismatic", T))
     smooth = surfels_of(surfels, judge.states, motions)
     border = border_in([front_of(smooth, T, part, s, reach) for s in (0, 1)], along)
     if border is None:

@@ -3,7 +3,6 @@ with a gap between them that is narrower than either: a tray that is seen in two
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -17,7 +16,7 @@ from p2gs.motion.discovery.rows import FACING, planes
 from p2gs.ops import se3
 from p2gs.ops.components import TOUCH, components
 from p2gs.parts.bodies import FEWEST
-from p2gs.parts.fronts import Surface, in_two, surfels_of
+from p2gs.parts.fronts import Surface, across, in_two, surfels_of
 from p2gs.visibility.surfels import Surfels
 
 
@@ -47,17 +46,20 @@ def part_side_by_side(
     split: part, the gap's width and those of the pieces beside it.
     """
     log: list[dict] = []
+    if "prismatic" not in motions.types:
+        return motions, log
+    surfaces, spacing = surfels_of(surfels, states, motions), max(s.spacing for s in surfels)
     part = 0
     while part < len(motions) < limit:
         gap = None
         if motions.types[part] == "prismatic":
-            surfaces, spacing = surfels_of(surfels, states, motions), max(s.spacing for s in surfels)
             gap = gap_behind(surfaces, motions.transforms[part], part, directions, spacing, apart)
         if gap is None:
             part += 1
             continue
         log.append({"part": part, "gap": gap.size, "widths": list(gap.widths)})
         motions = in_two(states, motions, part, gap.normal, gap.offset)
+        surfaces = surfels_of(surfels, states, motions)
     return motions, log
 
 
@@ -81,8 +83,7 @@ def gap_behind(
     along, reach = points @ way - (points[rows] @ way).median(), TOUCH * spacing
     behind = points[max(along < -reach, along > reach, key=lambda side: int(side.sum()))]
     pieces = _pieces(behind, reach)
-    across = directions[(directions @ way).abs() < math.sqrt(1 - FACING**2)]
-    gaps = [_gap(a, b, normal) for normal in across for a, b in combinations(pieces, 2)]
+    gaps = [_gap(a, b, normal) for normal in across(directions, way) for a, b in combinations(pieces, 2)]
     gaps = [g for g in gaps if reach < g.size < min(g.widths) and all(_on_both_sides(f, g) for f in fronts)]
     return min(gaps, key=lambda g: g.size, default=None)
 

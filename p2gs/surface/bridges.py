@@ -91,9 +91,12 @@ def bridge(
     numbers go on from the piece's vertices: of the six ways the shortest that nobody saw through, and what is longer by
     ``NEAR`` at most."""
     edges, best = open_edges(piece.faces), (np.inf, np.zeros((0, 3), np.int64))
+    if not len(edges) or not len(body):
+        return best[1]
+    tree = search_tree(body)
     reach = float(np.ptp(piece.vertices, axis=0).max())  # no bridge is longer than what it holds
-    for way in (*np.eye(3), *-np.eye(3)) if len(edges) and len(body) else ():
-        length, met = _meets(piece.vertices[edges], way, body, voxel, min(reach, best[0] + NEAR * voxel))
+    for way in (*np.eye(3), *-np.eye(3)):
+        length, met = _meets(piece.vertices[edges], way, tree, voxel, min(reach, best[0] + NEAR * voxel))
         rows = np.flatnonzero(np.isfinite(length).all(1))
         stops = piece.vertices[edges[rows]] + np.array(STOPS)[:, None, None, None] * length[rows, :, None] * way
         empty = seen_empty(torch.as_tensor(stops.reshape(-1, 3)), views, poses, OUT * voxel).numpy()
@@ -103,16 +106,14 @@ def bridge(
         rows = rows[length[rows].max(1) < least + NEAR * voxel]
         (a, b), (d, c) = edges[rows].T, met[rows].T + len(piece.vertices)
         faces = np.concatenate([np.stack(t, 1) for t in ((b, a, d), (b, d, c))])  # round as the piece's are
-        best = min(best, (least, faces[faces[:, 1] != faces[:, 2]]), key=lambda found: found[0])
+        best = (least, faces[faces[:, 1] != faces[:, 2]])
     return best[1]
 
 
-def _meets(
-    ends: np.ndarray, way: np.ndarray, body: np.ndarray, voxel: float, reach: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """How far points [E, 2, 3] go along ``way`` [3] until a point of ``body`` [N, 3] is within ``OUT`` voxels, up to
-    ``reach`` (inf: it never is), and which, [E, 2] each."""
-    tree, length, met = search_tree(body), np.full(ends.shape[:2], np.inf), np.zeros(ends.shape[:2], np.int64)
+def _meets(ends: np.ndarray, way: np.ndarray, tree, voxel: float, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """How far points [E, 2, 3] go along ``way`` [3] until a point of the body's search ``tree`` is within ``OUT``
+    voxels, up to ``reach`` (inf: it never is), and which, [E, 2] each."""
+    length, met = np.full(ends.shape[:2], np.inf), np.zeros(ends.shape[:2], np.int64)
     for far in np.arange(0.0, reach, voxel):
         left = np.isinf(length)
         distance, nearest = tree.query(ends[left] + far * way, distance_upper_bound=OUT * voxel)

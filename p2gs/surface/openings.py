@@ -323,11 +323,11 @@ def open_up(
     out = [Opening(torch.ones(len(x), dtype=torch.bool), x[:0]) for x in g]
     if min(int(k.sum()) for k in solid) < config.patch:  # no object: fusion says so
         return out, motions, stacks, counted
-    found = [
+    found = (
         unconfirmed(g[s], motions.labels[s], away[s], g[1 - s], motions.labels[1 - s], stacks[1 - s], config.apart)
         for s in (0, 1)
-    ]
-    lids, beside = [of[0] for of in found], [of[1] for of in found]
+    )
+    lids, beside = zip(*found, strict=True)
     base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
     box = torch.quantile(
         torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0

@@ -186,7 +186,7 @@ def test_unconfirmed_is_what_is_hidden_and_far_from_what_the_other_state_shows_o
     states, motions, _, stacks = scene(lid, [lid])
     (other, g), n = (s.gaussians for s in states), len(lid)
 
-    def asked(apart: float, labels: torch.Tensor) -> torch.Tensor:
+    def asked(apart: float, labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         away = se3.inverse(motions.transforms)
         return unconfirmed(g, motions.labels[1], away, other, labels, stacks[0], apart)
 
