@@ -22,7 +22,7 @@ from p2gs.motion.relabel import label_gaussians
 from p2gs.motion.survey import leave_false_minima
 from p2gs.native import at_once
 from p2gs.parts.askew import lay_axes
-from p2gs.parts.bodies import Surfaces, one_part_a_body
+from p2gs.parts.bodies import Surfaces, looked_through, one_part_a_body
 from p2gs.parts.expand import expand
 from p2gs.parts.fronts import part_fronts
 from p2gs.parts.options import PartMotionsConfig
@@ -173,12 +173,13 @@ def _neighbours(
     judge: Judge, found: Discovery, motions: PartMotions, sharpened: list[StateGaussians], limit: int
 ) -> tuple[PartMotions, dict]:
     """Parts that touch and go alike as one where they are one body, as two where they are two; what was done."""
-    states, surfels, apart = judge.states, found.problem.surfels, found.problem.scale.apart
+    states, problem, apart = judge.states, found.problem, found.problem.scale.apart
+    surfels, look = problem.surfels, partial(looked_through, stacks=problem.stacks, tau=problem.scale.tau)
     motions, joined = join_twins(states, motions, apart)
     if joined:
         motions = judge.refine(motions)
     faced = directions_of(states, motions) if "prismatic" in motions.types else torch.zeros(0, 3).double()
-    motions, beside = part_side_by_side(states, surfels, motions, faced, apart, limit)
+    motions, beside = part_side_by_side(states, surfels, motions, faced, apart, limit, look)
     if beside:
         motions = judge.improved(motions)[2]
     motions, seamless = join_seamless(judge, motions)

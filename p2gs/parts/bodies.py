@@ -50,20 +50,36 @@ def seen_empty(points: Tensor, motion: Tensor, stacks: list[DepthStack], tau: fl
     return empty
 
 
+def pairs_between(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Points [L, 3] of ``a`` [N, 3], at most ``BRIDGES``, and the nearest of ``b`` [M, 3] to each [L, 3]."""
+    d, j = cKDTree(b.numpy()).query(a.numpy())
+    order = np.argsort(d, kind="stable")
+    order = order[np.unique(np.linspace(0, len(order) - 1, min(BRIDGES, len(order))).astype(int))]
+    return a[order], b[j[order]]
+
+
+def lines_between(start: Tensor, end: Tensor) -> Tensor:
+    """[STOPS, L, 3] places on the lines between ``start`` and ``end`` [L, 3]."""
+    share = torch.linspace(0, 1, STOPS + 2, dtype=torch.float64)[1:-1, None, None]
+    return start + share * (end - start)
+
+
+def looked_through(lines: Tensor, motion: Tensor, stacks: list[DepthStack], tau: float) -> Tensor:
+    """[L] bool: was some place on each of ``lines`` [S, L, 3] (at the start) seen empty?"""
+    return seen_empty(lines.reshape(-1, 3), motion, stacks, tau).reshape(lines.shape[:2]).any(0)
+
+
 def bridged(
     a: Tensor, b: Tensor, motion: Tensor, stacks: list[DepthStack], tau: float, others: cKDTree | None, reach: float
 ) -> bool:
     """Can two pieces [N, 3], [M, 3] (at the start) be one body: is some line between them nowhere seen empty, nor near
     another part's surface (``others``, at the start, within ``reach``)?"""
-    d, j = cKDTree(b.numpy()).query(a.numpy())
-    order = np.argsort(d, kind="stable")
-    order = order[np.unique(np.linspace(0, len(order) - 1, min(BRIDGES, len(order))).astype(int))]
-    share = torch.linspace(0, 1, STOPS + 2, dtype=torch.float64)[1:-1, None, None]
-    line = a[order] + share * (b[j[order]] - a[order])
-    closed = seen_empty(line.reshape(-1, 3), motion, stacks, tau)
+    lines = lines_between(*pairs_between(a, b))
+    closed = looked_through(lines, motion, stacks, tau)
     if others is not None:
-        closed |= torch.from_numpy(others.query(line.reshape(-1, 3).numpy())[0] < reach)
-    return not bool(closed.reshape(STOPS, -1).any(0).all())
+        near = others.query(lines.reshape(-1, 3).numpy())[0] < reach
+        closed |= torch.from_numpy(near).reshape(lines.shape[:2]).any(0)
+    return not bool(closed.all())
 
 
 def bodies_of(surfaces: Surfaces, part: int, motion: Tensor, held: bool) -> list[list[Tensor]]:

@@ -47,6 +47,10 @@ def drawers(trays: list[tuple[float, ...]], T: torch.Tensor = STILL, opens: bool
     return states, surfels, PartMotions(["prismatic"], move[None], torch.ones(1), labels, margin)
 
 
+def seen_through(lines: torch.Tensor, motion: torch.Tensor) -> torch.Tensor:
+    return torch.ones(lines.shape[1], dtype=torch.bool)
+
+
 def turned() -> torch.Tensor:
     return se3.make(
         so3.rotvec_to_matrix(torch.tensor([0.2, -0.4, 0.9]).double()), torch.tensor([0.1, 0.2, -0.3]).double()
@@ -57,7 +61,7 @@ def turned() -> torch.Tensor:
 @pytest.mark.parametrize("T", [STILL, turned()])
 def test_two_trays_behind_one_front_are_two_parts(T, opens):
     states, surfels, motions = drawers([(0.04, 0.44), (0.56, 0.96)], T, opens)
-    two, log = part_side_by_side(states, surfels, motions, T[:3, :3].T, APART, 5)
+    two, log = part_side_by_side(states, surfels, motions, T[:3, :3].T, APART, 5, seen_through)
     assert [x["part"] for x in log] == [0] and log[0]["gap"] == pytest.approx(0.14, abs=SPACING)
     assert log[0]["widths"] == pytest.approx([0.38, 0.38], abs=SPACING)
     assert two.types == ["prismatic"] * 2 and torch.equal(two.transforms, motions.transforms.repeat(2, 1, 1))
@@ -81,24 +85,24 @@ def test_two_trays_behind_one_front_are_two_parts(T, opens):
 )
 def test_what_is_no_pair_of_trays_stays_one(trays):
     states, surfels, motions = drawers(trays)
-    assert part_side_by_side(states, surfels, motions, AXES, APART, 5) == (motions, [])
+    assert part_side_by_side(states, surfels, motions, AXES, APART, 5, seen_through) == (motions, [])
 
 
 def test_three_become_three_as_far_as_parts_may_be_had():
     states, surfels, motions = drawers([(0.02, 0.3), (0.36, 0.64), (0.7, 0.98)])
-    three, log = part_side_by_side(states, surfels, motions, AXES, APART, 5)
+    three, log = part_side_by_side(states, surfels, motions, AXES, APART, 5, seen_through)
     assert len(three) == 3 and len(log) == 2
     assert sorted(torch.bincount(three.labels[1])[1:].tolist()) == pytest.approx([495] * 3, rel=0.2)
-    assert len(part_side_by_side(states, surfels, motions, AXES, APART, 2)[0]) == 2
+    assert len(part_side_by_side(states, surfels, motions, AXES, APART, 2, seen_through)[0]) == 2
 
 
 def test_turns_and_directions_along_the_way_are_not_asked():
     states, surfels, motions = drawers([(0.04, 0.44), (0.56, 0.96)])
     surfaces = surfels_of(surfels, states, motions)
-    assert gap_behind(surfaces, motions.transforms[0], 0, AXES[[0, 2]], SPACING, APART) is None
-    assert gap_behind(surfaces, motions.transforms[0], 0, AXES[:0], SPACING, APART) is None
+    assert gap_behind(surfaces, motions.transforms[0], 0, AXES[[0, 2]], SPACING, APART, seen_through) is None
+    assert gap_behind(surfaces, motions.transforms[0], 0, AXES[:0], SPACING, APART, seen_through) is None
     motions.types[0] = "revolute"
-    assert part_side_by_side(states, surfels, motions, AXES, APART, 5) == (motions, [])
+    assert part_side_by_side(states, surfels, motions, AXES, APART, 5, seen_through) == (motions, [])
 
 
 @pytest.mark.parametrize("state", [0, 1])
@@ -106,7 +110,24 @@ def test_a_tray_without_a_front_is_no_drawer(state):
     states, surfels, motions = drawers([(0.04, 0.44), (0.56, 0.96)])
     surfaces = surfels_of(surfels, states, motions)
     asked = {"T": motions.transforms[0], "part": 0, "directions": AXES, "spacing": SPACING, "apart": APART}
+    asked["look"] = seen_through
     assert gap_behind(surfaces, **asked) is not None
     across = (surfaces[state].normals[:, 0].abs() > 0.9) & (surfaces[state].points[:, 1] > 0.5)
     surfaces[state].labels[across] = 0
     assert gap_behind(surfaces, **asked) is None
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6])
+def test_most_looks_must_go_through_the_gap(share):
+    """Of a tray under another one what is seen is at its sides: nobody saw that there is nothing between them."""
+    states, surfels, motions = drawers([(0.04, 0.44), (0.56, 0.96)])
+    asked = []
+
+    def look(lines, motion):
+        asked.append((lines, motion))
+        return torch.arange(lines.shape[1]) < share * lines.shape[1]
+
+    two, log = part_side_by_side(states, surfels, motions, AXES, APART, 2, look)
+    assert len(two) == len(log) + 1 == (2 if share > 0.5 else 1)
+    lines, motion = asked[0]
+    assert bool(((lines[..., 1] > 0.43) & (lines[..., 1] < 0.57)).all()) and torch.equal(motion, motions.transforms[0])
