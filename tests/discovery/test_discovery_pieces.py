@@ -152,17 +152,16 @@ def test_one_door_stays_one():
     assert all(total_score(problem, m, label(problem, m, found.graphs)) > alone for m in two)
 
 
-def test_where_a_part_lands_on_another_it_may_be_hidden_just_behind_it(stacked):
+def test_where_a_part_lands_on_another_it_is_as_wrong_as_in_empty_space(stacked):
     problem, graphs, _, truth = stacked
     right = label(problem, truth, graphs)
     swapped = Labelling([right.probability[0][:, [0, 2, 1]], right.probability[1]], right.cost)
     index = (right.labels(1) == 1).nonzero()[:, 0]
-    good, bad = violation(problem, truth, right, 1, index), violation(problem, truth, swapped, 1, index)
-    assert float(good.mean()) < 0.35 and float(bad.mean()) > float(good.mean()) + 0.1
-    assert float(((bad - Landing.HIDDEN).abs() < 1e-6).float().mean()) > 0.5
-    gone = Labelling([right.probability[0][:, [0, 2, 1]] * 0, right.probability[1]], right.cost)
-    away = replace(truth, amount=truth.amount * 0.5)  # where nothing is: looked through
-    assert float(violation(problem, away, gone, 1, index).median()) > 0.9
+    good = violation(problem, truth, right, 1, index)
+    assert (
+        float(good.mean()) < 0.35
+        and float(violation(problem, truth, swapped, 1, index).mean()) > float(good.mean()) + 0.1
+    )
     lost = Labelling([torch.eye(3)[torch.zeros(len(p), dtype=torch.long)] for p in right.probability], right.cost)
     moved = problem.moved[1].nonzero()[:, 0]
     assert bool((violation(problem, truth, lost, 1, moved) == 1).all())  # what moved is called static

@@ -39,11 +39,10 @@ def violation(
     light: TurnedLight | None = None,
 ) -> Tensor:
     """Cost [M] in 0..1 of the labelled surfels ``index`` [M] of ``state``: the share of the other state's views that
-    see through where a point is predicted, of those not blocked by something in front; where they see its own surface
-    in another colour, or none, as wrong as empty space (of a plate's other side, ``motions.thick`` away, colours tell
-    nothing); where all are blocked, or see another part's surface, behind which the point may be by less than depth
-    tells, ``Landing.HIDDEN``, or by the plate's other side ``Landing.TWO_SIDED``. A moved point that is called static
-    is wrong. light: of ``light_of``, if it is known."""
+    see through where a point is predicted, of those not blocked by something in front; where they see a surface that
+    came from elsewhere or has another colour, as wrong as empty space (of a plate's other side, ``motions.thick`` away,
+    colours tell nothing); where all are blocked ``Landing.HIDDEN``, or by the plate's other side ``Landing.TWO_SIDED``.
+    A moved point that is called static is wrong. light: of ``light_of``, if it is known."""
     light = light_of(problem, motions, labelling) if light is None else light
     surf, stack, other = problem.surfels[state], problem.stacks[1 - state], problem.surfels[1 - state]
     labels = labelling.labels(state)[index]
@@ -59,14 +58,12 @@ def violation(
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
     d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
     same = same_place(places, x, problem.scale.apart).gather(1, labelling.labels(1 - state)[j])
-    reach = 2 * problem.scale.spacing + problem.scale.tp
-    own, others = same & (d < reach + thick[:, None]), ~same & (d < reach)
+    own = same & (d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None])
     other_side = own & ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
     coloured = (other.colours[j] - colours[:, None]).abs().mean(2) < problem.config.recoloured
     like = other_side | (own & coloured)
     through = free / (free + on).clamp_min(1)
-    wrong = torch.where(others.any(1) & ~own.any(1), Landing.HIDDEN, WRONG)
-    shown = through + (1 - through) * torch.where(like.any(1), torch.zeros_like(wrong), wrong)
+    shown = through + (1 - through) * torch.where(like.any(1), 0.0, WRONG)
     hidden = torch.where(other_side.any(1), Landing.TWO_SIDED, Landing.HIDDEN)
     cost = torch.where(free + on > 0, shown, hidden.to(free))
     return torch.where((labels == 0) & problem.moved[state][index], torch.full_like(cost, WRONG), cost)
