@@ -157,7 +157,7 @@ def write_project(task: Task, folder: Path, count: int, seed: int) -> None:
     about = {"camera_model": "OPENCV", "ply_file_path": "points.ply", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(about))
     generator = torch.Generator().manual_seed(seed)
-    points, colours = initial_points(task.scene, task.state, count, "random", generator)
+    points, colours, _ = initial_points(task.scene, task.state, (count, count), "random", generator)
     rows = np.zeros(len(points), [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
     for i, (axis, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
         rows[axis], rows[colour] = points[:, i], (colours[:, i] * 255).round()

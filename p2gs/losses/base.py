@@ -43,7 +43,8 @@ class Target:
 
     image: [H, W, 3] float32 composited over ``background``.  alpha: [H, W] float32.  depth: [H, W] float32 (0 =
     unknown) or None.
-    background: [3].  key: identifies (view, resolution, crop) for cached statistics.
+    background: [3].  key: identifies (view, resolution, crop) for cached statistics of the image, None where its
+    background changes; view: the same, whatever the background.
     """
 
     image: Tensor
@@ -51,6 +52,7 @@ class Target:
     background: Tensor
     depth: Optional[Tensor] = None
     key: object = None
+    view: object = None
 
 
 @dataclass

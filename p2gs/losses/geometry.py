@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from p2gs.losses.base import Loss, LossInputs, register_loss
-from p2gs.ops.pixels import depth_spread
+from p2gs.ops.pixels import depth_range, depth_spread
 from p2gs.ops.planar import hidden_bends
 
 
@@ -16,22 +16,38 @@ class Depth(Loss):
     """mean log(1 + |d - d*|) over the pixels whose depth is known (ArtGS's form). Not in the paper; None without depth
     maps.
 
-    d is the mean depth of what the ray hits, in the scene's units; pixels that the render covers by less than
-    ``min_alpha`` are left out: their mean depth means little and its gradient is large.
+    d is the mean depth of what the ray hits, in internal units (the object's diagonal is 2). Left out are pixels that
+    the render covers by less than ``min_alpha``, whose mean depth means little and has a large gradient, and those next
+    to which depth jumps by more than ``edge`` (None: none): the photograph's pixel shows both surfaces, the map one.
     """
 
     needs = frozenset()
     kind = "image"
     weight: float = 0.5
     min_alpha: float = 0.1
+    edge: float | None = None
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
         render, target = inputs.render, inputs.target
         if render is None or target is None or target.depth is None:
             return None
         valid = (target.depth > 0) & (render.alpha.detach() > self.min_alpha)
+        if self.edge is not None:
+            valid &= _jumps(inputs) <= self.edge
         error = torch.where(valid, (render.expected_depth - target.depth).abs(), torch.zeros_like(target.depth))
         return error.log1p().sum() / valid.sum().clamp_min(1)
+
+
+def _jumps(inputs: LossInputs) -> Tensor:
+    """``depth_range`` of the target's depth map, of which every view has one at a time: found once."""
+    target = inputs.target
+    assert target is not None and target.depth is not None
+    if target.view is None:
+        return depth_range(target.depth)
+    key = ("depth_range", target.view)
+    if key not in inputs.cache:
+        inputs.cache[key] = depth_range(target.depth)
+    return inputs.cache[key]
 
 
 @register_loss("depth_variance")

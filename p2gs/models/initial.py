@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Sequence
+from typing import NamedTuple, Sequence
 
 import torch
 from torch import Tensor
@@ -13,20 +13,28 @@ HULL_MARGIN = 0.02  # of the image's long edge: silhouettes grow by it
 HULL_SHARE = 0.9  # share of the views that must see a point inside
 
 
+class Start(NamedTuple):
+    """Points [N, 3] with colours [N, 3] in 0..1; measured: they are depth points."""
+
+    points: Tensor
+    colours: Tensor
+    measured: bool
+
+
 def initial_points(
-    scene: TwoStateScene, state: int, count: int, init: str, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Points [N, 3] and colours [N, 3] to start from.
+    scene: TwoStateScene, state: int, counts: tuple[int, int], init: str, generator: torch.Generator
+) -> Start:
+    """What a state starts from. counts: how many random points, how many depth points.
 
     init "auto": depth points where every training view has depth, else as "random": uniform in the space that the
     state's (slightly grown) silhouettes enclose. Not on that hull's surface, which would seal concavities; not in the
     whole box either, since what no cropped view sees is never carved away.
     """
-    views = scene.select(state=state, split="train")
+    views, count = scene.select(state=state, split="train"), counts[0]
     if init == "auto" and scene.has_depth:
-        points, colours = depth_points(views, count, generator)
+        points, colours = depth_points(views, counts[1], generator)
         if len(points) > 100:
-            return points, colours
+            return Start(points, colours, True)
     assert scene.box is not None  # every scene that is trained on has one
     low, high = scene.box
     found, tries = [], 0
@@ -37,7 +45,7 @@ def initial_points(
     points = torch.cat(found)[:count]
     if len(points) < count:  # masks that enclose next to nothing
         points = torch.cat([points, low + torch.rand(count - len(points), 3, generator=generator) * (high - low)])
-    return points, torch.full((count, 3), 0.5)
+    return Start(points, torch.full((count, 3), 0.5), False)
 
 
 def inside_masks(points: Tensor, views: Sequence[View], size: int = 100) -> Tensor:

@@ -68,16 +68,19 @@ class SplatRates:
 class SingleStateConfig(ImageConfig):
     """Options of the single-state phase.
 
-    steps: paper 30,000.  initial_gaussians: random points in the object's box (or depth points where ``init`` says so).
-    sh_degree: 0-3.  sh_every: steps until the next degree is switched on.  init: "auto" takes depth points where the
-    scene has depth, "random" never does.  initial_opacity: low, so that concavities stay open until the images fill
-    them.  min_visible: Gaussians of which no training view sees this share are left out at the end: nothing formed them
-    (0 = keep all).  forgive: errors of single photographs.
+    steps: paper 30,000. initial_gaussians: random points in the object's box, or depth_gaussians depth points where
+    ``init`` says so. sh_degree: 0-3. sh_every: steps until the next degree is switched on. init: "auto" takes depth
+    points where the scene has depth, "random" never does. initial_opacity: of random points, low, so that concavities
+    stay open until the images fill them; depth_opacity: of depth points. min_visible: Gaussians of which no training
+    view sees this share are left out at the end: nothing formed them (0 = keep all). forgive: errors of single
+    photographs.
     """
 
     steps: int = 6000
     initial_gaussians: int = 10000
     initial_opacity: float = 0.1
+    depth_gaussians: int = 10000
+    depth_opacity: float = 0.1
     init: Literal["auto", "random"] = "auto"
     sh_degree: int = 1
     sh_every: int = 500
@@ -119,7 +122,7 @@ class ImagePhase(Phase):
         device = self.splats.means.device
         depth = None if picked.depth is None else picked.depth.to(device)
         return picked.camera.to(device), Target(
-            picked.image.to(device), picked.alpha.to(device), background.to(device), depth, key
+            picked.image.to(device), picked.alpha.to(device), background.to(device), depth, key, picked.key
         )
 
     def picture(self, state: int):
@@ -200,8 +203,10 @@ class SingleStatePhase(StatePhase):
         **common,
     ):
         super().__init__(config, losses, state, views, **common)
-        points, colours = initial_points(scene, state, config.initial_gaussians, config.init, self.generator(0, 2))
-        self.splats = Splats(isotropic_gaussians(points, colours, config.initial_opacity, config.sh_degree))
+        counts = (config.initial_gaussians, config.depth_gaussians)
+        start = initial_points(scene, state, counts, config.init, self.generator(0, 2))
+        opacity = config.depth_opacity if start.measured else config.initial_opacity
+        self.splats = Splats(isotropic_gaussians(start.points, start.colours, opacity, config.sh_degree))
         self.shots = scene.select(state=state, split="train")
         self.errors, self.put_right = ViewErrors(len(self.shots)), None
 

@@ -101,7 +101,7 @@ def tune(
         state, shot, background = steps.shot(step)
         depth = None if shot.depth is None else shot.depth.to(device)
         camera, background = shot.camera.to(device), background.to(device)
-        target = Target(shot.image.to(device), shot.alpha.to(device), background, depth)
+        target = Target(shot.image.to(device), shot.alpha.to(device), background, depth, view=shot.key)
         g = splats.tensors()
         posed = g.placed(*moves[state](g.means, g.quats))
         depth_sq = any("depth_sq" in loss.needs for loss in losses.values())

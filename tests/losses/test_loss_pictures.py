@@ -124,6 +124,20 @@ def test_depth_is_logarithmic_over_what_is_known():
     assert LOSSES["depth"]()(nothing).item() == 0
 
 
+def test_depth_leaves_out_what_lies_next_to_a_jump():
+    inputs = make_inputs()
+    known, r = inputs.target.depth, inputs.render
+    terms = []
+    for y in range(known.shape[0]):
+        for x in range(known.shape[1]):
+            around = known[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+            around = around[around > 0]  # what is not known is no jump
+            if known[y, x] > 0 and r.alpha[y, x] > 0.1 and around.max() - around.min() <= 1.2:
+                terms.append(math.log(1 + abs((r.depth[y, x] / r.alpha[y, x] - known[y, x]).item())))
+    assert 0 < len(terms) < 60
+    assert LOSSES["depth"](weight=1.0, edge=1.2)(inputs).item() == pytest.approx(sum(terms) / len(terms))
+
+
 def test_depth_variance_is_twice_its_mean_over_the_foreground():
     inputs = make_inputs()
     terms = []
