@@ -43,12 +43,14 @@ def plinth_height(mesh: Mesh, axis: int, outward: float, at: float, height: floa
     """How high the plinth is on which a mesh of ``height`` stands at ``at``, ``outward`` (1 or -1) being down along the
     axis; 0 where it stands on none."""
     lowest, highest = (int(share * height / voxel) for share in HEIGHT)
-    edge = edges(mesh, axis, outward, at, highest + ABOVE, voxel)
+    edge = edges(mesh, axis, outward, at, highest + 1 + ABOVE, voxel)
     best, found = STEP * height, 0
     for h in range(max(lowest, LEAST), highest + 1):
         below = np.median(edge[1:h], axis=0)
         straight = (np.abs(edge[1:h] - below) < STRAIGHT * voxel).mean(0) > MOST
-        step = np.where(straight & (edge[h - 1] < below + STRAIGHT * voxel), edge[h : h + ABOVE].min(0) - below, 0.0)
+        outside = below + STRAIGHT * voxel
+        begins = straight & (edge[h - 1] < outside) & (edge[h] >= outside)  # a level may lie half over it
+        step = np.where(begins, edge[h + 1 : h + 1 + ABOVE].min(0) - below, 0.0)
         if np.nanmax(step, initial=0.0) > best:  # a level without walls is no part of a step
             best, found = np.nanmax(step), h
     return found * voxel

@@ -121,3 +121,13 @@ def test_toes_fit_under_a_front_that_stands_on_a_plinth(height, back, found):
     high = plinth_height(mesh, 2, -1.0, -0.5, 1.0, 0.01)
     assert high == pytest.approx(height, abs=0.02) if found else high == 0.0
     assert plinth_height(mesh, 2, 1.0, 0.5, 1.0, 0.01) == 0.0
+
+
+def test_the_level_in_which_a_plinth_ends_may_lie_half_over_it(monkeypatch):
+    out = np.full((60, 4), 0.4)  # levels of 0.01, how far out they reach towards four sides
+    out[12:, 1] = 0.5
+    out[12, 1] = 0.44
+    monkeypatch.setattr("p2gs.surface.plinth.edges", lambda mesh, axis, outward, at, levels, voxel: out[:levels])
+    assert plinth_height(Mesh.empty(), 2, -1.0, -0.5, 1.0, 0.01) == pytest.approx(0.12)
+    out[12, 1] = 0.5
+    assert plinth_height(Mesh.empty(), 2, -1.0, -0.5, 1.0, 0.01) == pytest.approx(0.12)
