@@ -266,12 +266,17 @@ def complete_tray(
 
 
 def clear_way(body: Mesh, tray: Tray, voxel: float) -> Mesh:
-    """What a tray slides into (in the start state) without what stands in its way: dim insides of drawers are drawn as
-    lids, which may be taken for the body's."""
-    middle = Faces(body.transformed(tray.shut), tray.front.axes).middle
-    lo, hi = tray.lo + CLEAR * voxel, tray.hi - CLEAR * voxel
-    hi[0] += tray.travel
-    return _without(body, ((middle > lo) & (middle < hi)).all(1))
+    """What a tray slides into (in the start state) without what stands in its way, as dim insides of drawers are drawn
+    as lids, which may be taken for the body's; and without what lies on its bottom and faces its mouth where it stands
+    while it is open: it would hide a board of the body's there."""
+    faces = Faces(body.transformed(tray.shut), tray.front.axes)
+    within, into = tray.within(faces.middle), faces.normal[:, 1 + tray.mouth[0]] * (2 * tray.mouth[1] - 1) > FLAT
+    within[:, 3] += tray.travel  # towards the front
+    inside = within > CLEAR * voxel
+    bottom = (tray.mouth_side + 3) % 6
+    covered = (within[:, 0] > tray.travel + CLEAR * voxel) & np.delete(inside, bottom, 1).all(1)
+    on_bottom = covered & into & (within[:, bottom] > -ON * voxel)
+    return _without(body, inside.all(1) | on_bottom)
 
 
 def not_the_trays(other: Mesh, tray: Tray, place: np.ndarray, voxel: float) -> Mesh:

@@ -147,3 +147,26 @@ def test_a_patch_of_another_part_on_the_trays_side_goes(shifts):
         other = sheet(np.array([at[0] + shifts[0], *at[1:]]) - place[:3, 3], (0.1, 0.001, 0.04))
         kept = not_the_trays(other, tray, place, VOXEL)
         assert len(kept.faces) == (0 if abs(at[1]) in (0.32, 0.31) else 12), at
+
+
+@pytest.mark.parametrize("shifts", [(0.0, TRAVEL), (TRAVEL, 0.0)])
+def test_what_lies_on_the_trays_bottom_and_faces_its_mouth_is_not_the_bodys(shifts):
+    """Where the open drawer covers it: what faces down (a board's underside), and what lies behind the open drawer, is
+    the body's."""
+    _, body, tray, _ = found(TRAY, shifts=shifts)
+    bottom = -0.16
+
+    def patch(x, z, up):
+        faces = np.array([[0, 1, 2], [0, 2, 3]])[:, :: 1 if up else -1]
+        corners = np.array([[x, -0.1, z], [x + 0.1, -0.1, z], [x + 0.1, 0.1, z], [x, 0.1, z]])
+        return Mesh(corners, faces, np.zeros((4, 3), np.uint8))
+
+    for x, z, up, goes in [
+        (0.2, bottom, True, True),
+        (0.2, bottom - 0.01, True, True),
+        (0.2, bottom - 0.01, False, False),
+        (0.2, bottom - 0.1, True, False),
+        (-0.3, bottom - 0.01, True, False),
+    ]:
+        cleared = clear_way(Mesh.join([body, patch(x, z, up)]), tray, VOXEL)
+        assert len(cleared.faces) == len(body.faces) + (0 if goes else 2), (x, z, up)
