@@ -14,7 +14,7 @@ from p2gs.losses.base import Loss
 from p2gs.models.joint_of import constrain, make_joint, name_types
 from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig, tune
-from p2gs.models.twin_labels import clean_labels, rows_as_found, settle_labels, state_labels, surviving_slots
+from p2gs.models.twin_labels import clean_labels, rows_as_found, settle_labels, state_labels, surviving_slots, with_mass
 from p2gs.motion.directions import shared_axes
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
@@ -27,6 +27,8 @@ from p2gs.parts.fronts import weighed_amounts
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import drop_needless, drop_untold, own_shares, settle_types
 from p2gs.types import ArticulatedObject, GaussianTensors, Part, Similarity
+
+EMPTY = "vanished: no Gaussians of its own, or no motion"
 
 
 @dataclass
@@ -148,6 +150,10 @@ def finish(
     twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
     limits = {"islands": config.islands, "trays": config.trays, "tau": config.polish.free_static or 0.02}
     labels, moved = settle_labels(twin, views, stacks, **limits, backend=twin_backend or backend)
+    labels, stay = with_mass(learned.gaussians, labels, len(types), config.min_mass)
+    notes += [f"slot {alive[k]} of {len(learned.types)} {EMPTY}" for k in range(len(types)) if k not in stay]
+    alive, types, transforms = [alive[k] for k in stay], [types[k] for k in stay], transforms[stay]
+    keep, axes = keep[stay], axes[stay]
     found = [state_labels(learned, labels, s, transforms) for s in states]
     record = FinishRecord(
         [f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive, contents=moved
@@ -178,8 +184,7 @@ def _slots(learned: Articulation, labels: Tensor, config: FinishConfig) -> tuple
     remap = torch.zeros(slots + 1, dtype=torch.int64)
     for new, old in enumerate(alive):
         remap[old] = new + 1
-    why = "vanished: no Gaussians of its own, or no motion"
-    return remap[labels], alive, [f"slot {k} of {slots} {why}" for k in range(1, slots + 1) if k not in alive]
+    return remap[labels], alive, [f"slot {k} of {slots} {EMPTY}" for k in range(1, slots + 1) if k not in alive]
 
 
 def _typed(learned: Articulation, labels: Tensor, keep: Tensor, below: float) -> tuple[list[str], Tensor]:

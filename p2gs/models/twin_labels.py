@@ -93,6 +93,16 @@ def surviving_slots(learned: Articulation, labels: Tensor, min_mass: float, min_
     return alive
 
 
+def with_mass(g: GaussianTensors, labels: Tensor, count: int, least: float) -> tuple[Tensor, list[int]]:
+    """Labels [N] without the parts, of ``count``, that have less than ``least`` of the solid Gaussians (they become the
+    base's), and the numbers from 0 of those that stay: settling labels may leave a part next to nothing."""
+    solid = torch.bincount(labels[g.solid], minlength=count + 1)
+    stay = [k for k in range(count) if int(solid[k + 1]) >= least * int(solid.sum())]
+    remap = torch.zeros(count + 1, dtype=torch.int64)
+    remap[torch.tensor(stay, dtype=torch.int64) + 1] = torch.arange(len(stay)) + 1
+    return remap[labels], stay
+
+
 def state_labels(
     learned: Articulation, labels: Tensor, state: StateGaussians, transforms: Tensor, k: int = 6
 ) -> tuple[Tensor, Tensor]:
