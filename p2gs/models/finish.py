@@ -14,7 +14,15 @@ from p2gs.losses.base import Loss
 from p2gs.models.joint_of import constrain, make_joint, name_types
 from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig, tune
-from p2gs.models.twin_labels import clean_labels, rows_as_found, settle_labels, state_labels, surviving_slots, with_mass
+from p2gs.models.twin_labels import (
+    clean_labels,
+    only,
+    rows_as_found,
+    settle_labels,
+    state_labels,
+    surviving_slots,
+    with_mass,
+)
 from p2gs.motion.directions import shared_axes
 from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
 from p2gs.motion.joint_range import extend_ranges
@@ -150,10 +158,11 @@ def finish(
     twin = assemble(learned.gaussians, labels, types, transforms, time, similarity)
     limits = {"islands": config.islands, "trays": config.trays, "tau": config.polish.free_static or 0.02}
     labels, moved = settle_labels(twin, views, stacks, **limits, backend=twin_backend or backend)
-    labels, stay = with_mass(learned.gaussians, labels, len(types), config.min_mass)
-    notes += [f"slot {alive[k]} of {len(learned.types)} {EMPTY}" for k in range(len(types)) if k not in stay]
-    alive, types, transforms = [alive[k] for k in stay], [types[k] for k in stay], transforms[stay]
-    keep, axes = keep[stay], axes[stay]
+    stay = with_mass(learned.gaussians, labels, len(types), config.min_mass)  # settling may leave next to nothing
+    labels, rows = only(labels, stay, len(types)), [k - 1 for k in stay]
+    notes += [f"slot {slot} of {len(learned.types)} {EMPTY}" for k, slot in enumerate(alive) if k not in rows]
+    alive, types, transforms = [alive[k] for k in rows], [types[k] for k in rows], transforms[rows]
+    keep, axes = keep[rows], axes[rows]
     found = [state_labels(learned, labels, s, transforms) for s in states]
     record = FinishRecord(
         [f[0] for f in found], [f[1] for f in found], transforms, transforms, slots=alive, contents=moved
@@ -181,10 +190,8 @@ def _slots(learned: Articulation, labels: Tensor, config: FinishConfig) -> tuple
     slots = len(learned.types)
     labels = clean_labels(learned.gaussians, labels, slots + 1, config.clean_neighbours)
     alive = surviving_slots(learned, labels, config.min_mass, config.min_motion)
-    remap = torch.zeros(slots + 1, dtype=torch.int64)
-    for new, old in enumerate(alive):
-        remap[old] = new + 1
-    return remap[labels], alive, [f"slot {k} of {slots} {EMPTY}" for k in range(1, slots + 1) if k not in alive]
+    gone = [f"slot {k} of {slots} {EMPTY}" for k in range(1, slots + 1) if k not in alive]
+    return only(labels, alive, slots), alive, gone
 
 
 def _typed(learned: Articulation, labels: Tensor, keep: Tensor, below: float) -> tuple[list[str], Tensor]:

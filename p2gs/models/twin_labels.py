@@ -79,12 +79,8 @@ def surviving_slots(learned: Articulation, labels: Tensor, min_mass: float, min_
     """Movable slots with mass and motion (``FinishConfig``), as slot numbers; labels [N]."""
     solid = learned.gaussians.solid
     alive = []
-    for k in range(1, len(learned.types) + 1):
-        rows = solid & (labels == k)
-        mass = float(rows.sum()) / max(float(solid.sum()), 1.0)
-        if mass < min_mass:
-            continue
-        points = learned.gaussians.means[rows].double()
+    for k in with_mass(learned.gaussians, labels, len(learned.types), min_mass):
+        points = learned.gaussians.means[solid & (labels == k)].double()
         at = [
             se3.apply(se3.screw_at(learned.transforms[k - 1], s - learned.canonical_time), points) for s in (0.0, 1.0)
         ]
@@ -93,14 +89,17 @@ def surviving_slots(learned: Articulation, labels: Tensor, min_mass: float, min_
     return alive
 
 
-def with_mass(g: GaussianTensors, labels: Tensor, count: int, least: float) -> tuple[Tensor, list[int]]:
-    """Labels [N] without the parts, of ``count``, that have less than ``least`` of the solid Gaussians (they become the
-    base's), and the numbers from 0 of those that stay: settling labels may leave a part next to nothing."""
-    solid = torch.bincount(labels[g.solid], minlength=count + 1)
-    stay = [k for k in range(count) if int(solid[k + 1]) >= least * int(solid.sum())]
+def with_mass(g: GaussianTensors, labels: Tensor, count: int, least: float) -> list[int]:
+    """Of the labels 1 to ``count`` those that at least the share ``least`` of the solid Gaussians has; labels [N]."""
+    held = torch.bincount(labels[g.solid], minlength=count + 1).tolist()
+    return [k for k in range(1, count + 1) if held[k] / max(sum(held), 1) >= least]
+
+
+def only(labels: Tensor, stay: list[int], count: int) -> Tensor:
+    """Labels [N] of 0 to ``count`` numbered anew: those of ``stay`` 1, 2, ... in its order, all others the base's."""
     remap = torch.zeros(count + 1, dtype=torch.int64)
-    remap[torch.tensor(stay, dtype=torch.int64) + 1] = torch.arange(len(stay)) + 1
-    return remap[labels], stay
+    remap[torch.tensor(stay, dtype=torch.int64)] = torch.arange(len(stay)) + 1
+    return remap[labels]
 
 
 def state_labels(

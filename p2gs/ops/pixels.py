@@ -44,12 +44,16 @@ def depth_spread(alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor,
     return ((alpha * depth_sq - first * first) * inside).sum() / inside.sum().clamp_min(1)
 
 
+def greatest_around(maps: Tensor) -> Tensor:
+    """The greatest of the 3 x 3 values about each of float maps [..., H, W], of the same shape."""
+    return F.max_pool2d(maps.reshape(-1, 1, *maps.shape[-2:]), 3, 1, 1).reshape(maps.shape)
+
+
 def depth_range(depth: Tensor) -> Tensor:
     """By how much the known depths (above 0) within the 3 x 3 pixels about each of a map [H, W] differ, [H, W]; 0 where
     none is known."""
-    far, near = (torch.where(depth > 0, sign * depth, -torch.inf)[None, None] for sign in (1, -1))
-    apart = F.max_pool2d(far, 3, 1, 1)[0, 0] + F.max_pool2d(near, 3, 1, 1)[0, 0]
-    return apart.clamp_min(0)
+    far, less_near = (greatest_around(torch.where(depth > 0, sign * depth, -torch.inf)) for sign in (1, -1))
+    return (far + less_near).clamp_min(0)
 
 
 # The gradients are made in the backward pass: their factor is known there, and no pass over the pixels is spent on it

@@ -14,6 +14,7 @@ from p2gs.gaussians.pose import part_transform, pose
 from p2gs.gaussians.views import bounds
 from p2gs.ops.blend import likeliest
 from p2gs.ops.mesh import Mesh
+from p2gs.ops.pixels import greatest_around
 from p2gs.render.base import MAX_FEATURES
 from p2gs.surface.bridges import without_crumbs
 from p2gs.surface.depth_view import DepthView, add_normals
@@ -93,8 +94,8 @@ def trust(seen: PartView, limit: float) -> Tensor:
 
 def beside_others(label: Tensor) -> Tensor:
     """Pixels [H, W] bool beside those of another label: what they saw may be a mean of both."""
-    x = label[None, None].float()
-    return (torch.nn.functional.max_pool2d(x, 3, 1, 1) != -torch.nn.functional.max_pool2d(-x, 3, 1, 1))[0, 0]
+    x = label.float()
+    return greatest_around(x) != -greatest_around(-x)
 
 
 @dataclass

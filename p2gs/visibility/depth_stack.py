@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from p2gs.native import native, num_threads
+from p2gs.ops.pixels import greatest_around
 from p2gs.types import Camera
 
 
@@ -66,9 +67,8 @@ class DepthStack:
         K = self.K[:, [0, 1, 0, 1], [0, 1, 2, 2]]
         # [V, 18] as the kernel reads cameras
         self.rows = torch.cat([R_t, K, self.size.flip(1)], 1).float().contiguous()
-        z = torch.where(self.valid, self.depth, torch.full_like(self.depth, torch.inf))[:, None]
-        self.far = torch.nn.functional.max_pool2d(z, 3, 1, 1)[:, 0].contiguous()
-        self.near = (-torch.nn.functional.max_pool2d(-z, 3, 1, 1)[:, 0]).contiguous()
+        z = torch.where(self.valid, self.depth, torch.full_like(self.depth, torch.inf))
+        self.far, self.near = greatest_around(z), -greatest_around(-z)
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -13,7 +13,15 @@ from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.models.finish import FinishConfig, finish
 from p2gs.models.joint_of import constrain, make_joint, name_types
 from p2gs.models.tune import TuneConfig
-from p2gs.models.twin_labels import clean_labels, majority, rows_as_found, state_labels, surviving_slots, with_mass
+from p2gs.models.twin_labels import (
+    clean_labels,
+    majority,
+    only,
+    rows_as_found,
+    state_labels,
+    surviving_slots,
+    with_mass,
+)
 from p2gs.motion.joint_confidence import state_depth
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
@@ -253,9 +261,11 @@ def test_a_part_that_settling_leaves_next_to_nothing_is_the_bases():
     )
     labels = torch.zeros(1000, dtype=torch.int64)
     labels[:400], labels[400], labels[500:600] = 1, 2, 3
-    settled, stay = with_mass(g, labels, 3, 0.002)
-    assert stay == [0, 2] and torch.bincount(settled).tolist() == [500, 400, 100]
-    assert with_mass(g, labels, 3, 0.001)[1] == [0, 1, 2] and torch.equal(with_mass(g, labels, 3, 0.0)[0], labels)
+    stay = with_mass(g, labels, 3, 0.002)
+    settled = only(labels, stay, 3)
+    assert stay == [1, 3] and torch.bincount(settled).tolist() == [500, 400, 100]
+    assert with_mass(g, labels, 3, 0.001) == [1, 2, 3] == with_mass(g, labels, 3, 0.0)
+    assert torch.equal(only(labels, [1, 2, 3], 3), labels)
 
 
 def test_a_drawer_of_a_row_stays_though_photographs_hardly_need_it():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from p2gs.data.views import TrainingViews
 from p2gs.models.initial import initial_points
 from p2gs.models.single_state import SingleStateConfig, SingleStatePhase
 from p2gs.types import Camera, TwoStateScene, View
@@ -46,8 +47,6 @@ def test_random_points_where_depth_is_not_wanted_or_not_there(init, depth):
 
 
 def test_depth_points_have_a_number_and_an_opacity_of_their_own():
-    from p2gs.data.views import TrainingViews
-
     scene = wall_scene()
     config = SingleStateConfig(
         levels=[SIZE], level_starts=[0.0], initial_gaussians=60, initial_opacity=0.02, depth_gaussians=200,
