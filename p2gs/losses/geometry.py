@@ -1,5 +1,5 @@
-"""Losses on geometry: ``depth``, ``depth_variance`` and ``planar`` on rendered depth, ``flat`` on the Gaussians
-themselves."""
+"""Losses on geometry: ``depth``, ``surface_depth``, ``depth_variance`` and ``planar`` on rendered depth, ``flat`` on
+the Gaussians themselves."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from torch import Tensor
 from p2gs.losses.base import Loss, LossInputs, register_loss
 from p2gs.ops.pixels import depth_range, depth_spread
 from p2gs.ops.planar import hidden_bends
+from p2gs.ops.planes import plane_error
+from p2gs.ops.rays import camera_rays
 
 
 @register_loss("depth")
@@ -16,9 +18,10 @@ class Depth(Loss):
     """mean log(1 + |d - d*|) over the pixels whose depth is known (ArtGS's form). Not in the paper; None without depth
     maps.
 
-    d is the mean depth of what the ray hits, in internal units (the object's diagonal is 2). Left out are pixels that
-    the render covers by less than ``min_alpha``, whose mean depth means little and has a large gradient, and those next
-    to which depth jumps by more than ``edge`` (None: none): the photograph's pixel shows both surfaces, the map one.
+    d is the mean depth of the middles of what the ray hits, in internal units (the object's diagonal is 2). Left out
+    are pixels that the render covers by less than ``min_alpha``, whose mean depth means little and has a large
+    gradient, and those next to which depth jumps by more than ``edge`` (None: none): the photograph's pixel shows both
+    surfaces, the map one.
     """
 
     needs = frozenset()
@@ -28,14 +31,40 @@ class Depth(Loss):
     edge: float | None = None
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
-        render, target = inputs.render, inputs.target
-        if render is None or target is None or target.depth is None:
+        known, counted = _known_depth(inputs, self.min_alpha, self.edge)
+        if known is None or inputs.render is None:
             return None
-        valid = (target.depth > 0) & (render.alpha.detach() > self.min_alpha)
-        if self.edge is not None:
-            valid &= _jumps(inputs) <= self.edge
-        error = torch.where(valid, (render.expected_depth - target.depth).abs(), torch.zeros_like(target.depth))
-        return error.log1p().sum() / valid.sum().clamp_min(1)
+        error = torch.where(counted, (inputs.render.expected_depth - known).abs(), torch.zeros_like(known))
+        return error.log1p().sum() / counted.sum().clamp_min(1)
+
+
+@register_loss("surface_depth")
+class SurfaceDepth(Depth):
+    """``depth`` of the surface: where rays meet the Gaussians' planes (``ops.planes.plane_error``), of which meshes are
+    made, too. Not in the paper; None without depth maps.
+
+    Held by their middles, which lean towards the camera where rays graze, Gaussians end behind the true surface.
+    """
+
+    needs = frozenset({"planes"})
+    kind = "image"
+    weight: float = 10.0
+    edge: float | None = 0.1
+
+    def compute(self, inputs: LossInputs) -> Tensor | None:
+        known, counted = _known_depth(inputs, self.min_alpha, self.edge)
+        if known is None or inputs.render is None or inputs.render.features is None or inputs.camera is None:
+            return None
+        return plane_error(inputs.render.features, camera_rays(inputs.camera).to(known.device), known, counted)
+
+
+def _known_depth(inputs: LossInputs, min_alpha: float, edge: float | None) -> tuple[Tensor | None, Tensor]:
+    """The target's depth map [H, W], None without one, and the pixels [H, W] bool at which it counts (``Depth``)."""
+    render, target = inputs.render, inputs.target
+    if render is None or target is None or target.depth is None:
+        return None, torch.zeros(0, dtype=torch.bool)
+    counted = (target.depth > 0) & (render.alpha.detach() > min_alpha)
+    return target.depth, counted if edge is None else counted & (_jumps(inputs) <= edge)
 
 
 def _jumps(inputs: LossInputs) -> Tensor:

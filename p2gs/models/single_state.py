@@ -141,6 +141,7 @@ class ImagePhase(Phase):
             background,
             sh_degree=sh_degree,
             depth_sq=self.needed("depth_sq"),
+            planes=self.needed("planes"),
             absgrad=self.track_gradients,
             backend=self.rasterizer,
         )

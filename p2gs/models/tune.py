@@ -104,8 +104,8 @@ def tune(
         target = Target(shot.image.to(device), shot.alpha.to(device), background, depth, view=shot.key)
         g = splats.tensors()
         posed = g.placed(*moves[state](g.means, g.quats))
-        depth_sq = any("depth_sq" in loss.needs for loss in losses.values())
-        render = render_gaussians(posed, camera, background, depth_sq=depth_sq, backend=backend)
+        made = {what: any(what in loss.needs for loss in losses.values()) for what in ("depth_sq", "planes")}
+        render = render_gaussians(posed, camera, background, backend=backend, **made)
         inputs = LossInputs(step, config.steps, g, render, target, camera, cache=cache)
         values = [value for value in (loss(inputs) for loss in losses.values()) if value is not None]
         if not values:  # none is due in this step

@@ -22,6 +22,7 @@ void bind_blend(nb::module_& m);
 void bind_carry(nb::module_& m);
 void bind_image(nb::module_& m);
 void bind_planar(nb::module_& m);
+void bind_planes(nb::module_& m);
 void bind_ssim(nb::module_& m);
 void bind_knn(nb::module_& m);
 void bind_evidence(nb::module_& m);

@@ -75,6 +75,7 @@ NB_MODULE(_native, m) {
     bind_carry(m);
     bind_image(m);
     bind_planar(m);
+    bind_planes(m);
     bind_ssim(m);
     bind_pull(m);
     bind_raster(m);

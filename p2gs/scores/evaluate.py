@@ -13,8 +13,8 @@ ground truth.
     (over white;
                  only with torchvision and its AlexNet weights at hand, see metrics.lpips), alpha_error,
                  depth_median, depth_p90, depth_bad}: photographs that the fit did not train on where there are any;
-                 psnr_masked over the object's pixels only, alpha_error mean |alpha - mask|, depth_* of |expected depth
-                 - true| on the object, depth_bad the fraction off by more than 1 % of the object's diagonal
+                 psnr_masked over the object's pixels only, alpha_error mean |alpha - mask|, depth_* of |depth - true|
+                 on the object, by the Gaussians' planes, depth_bad the fraction off by more than 1 % of its diagonal
     chamfer      {static|movable|whole: {value, floor}, parts, failures}: x1000, see metrics.chamfer.ChamferReport
     chamfer_seen the same of the meshes without the faces that close what nobody saw
     penetration  {mean, max}: fraction of the moving Gaussians inside the base, over five states
@@ -40,6 +40,7 @@ from p2gs.metrics.lpips import wanted as lpips_wanted
 from p2gs.metrics.lpips import why_absent
 from p2gs.metrics.modules import JointError, PartChamfer, Penetration, ViewQuality
 from p2gs.models.registered import as_fitted
+from p2gs.ops.planes import plane_features
 from p2gs.surface.mesh import read_mesh, read_meshes
 from p2gs.surface.protocol import surface_options
 from p2gs.types import ArticulatedObject, TwoStateScene, UserError
@@ -138,7 +139,8 @@ def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]
             continue
         gaussians, quality = pose(obj, float(state)), ViewQuality()
         for view in views:
-            quality.update(draw(gaussians, view.camera, 0.0), view, diagonal)
+            planes = plane_features(gaussians.means, gaussians.quats, gaussians.log_scales, view.camera)
+            quality.update(draw(gaussians, view.camera, 0.0, features=planes), view, diagonal)
         out[name] = {"split": split, "count": len(views)} | quality.means()
     why = why_absent() if out and lpips_wanted() else None
     if why is not None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Optional
 
 import torch
 from torch import Tensor
 
+from p2gs.ops.rays import camera_rays
 from p2gs.types import Camera
 
 
@@ -28,18 +28,6 @@ class DepthView:
     normal_dot: Optional[Tensor] = None
     # [H, W] weight of the sighting: between ray and normal, 0 where the depth has an edge
     cosine: Optional[Tensor] = None
-
-
-def camera_rays(camera: Camera) -> Tensor:
-    """Directions of unit z through the pixel centres, camera coordinates, [H, W, 3] float32. Not to be written to."""
-    return _rays(tuple(camera.K.double().flatten().tolist()), camera.width, camera.height)
-
-
-@lru_cache(maxsize=2)  # the views of a scene mostly share their intrinsics
-def _rays(K: tuple[float, ...], width: int, height: int) -> Tensor:
-    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    pixels = torch.stack([u, v, torch.ones_like(u)], -1).double()
-    return (pixels @ torch.linalg.inv(torch.tensor(K, dtype=torch.float64).reshape(3, 3)).T).float()
 
 
 def add_normals(view: DepthView, edge: float) -> DepthView:

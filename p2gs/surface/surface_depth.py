@@ -1,9 +1,4 @@
-"""Depth of a surface made of Gaussians: where rays meet the Gaussians' planes, not how far away their middles are.
-
-A ray that grazes a surface of large flat Gaussians meets, in front, tails of Gaussians whose middles are nearer than
-the surface is there. Depth composited from middles is off by as much as the Gaussians are large, differently in every
-view, and the surface is torn.
-"""
+"""Depth of a surface made of Gaussians, where rays meet their planes (``ops.planes``), and how far these lie apart."""
 
 from __future__ import annotations
 
@@ -11,35 +6,18 @@ import torch
 from torch import Tensor
 
 from p2gs.gaussians.paint import draw
-from p2gs.ops import so3
-from p2gs.surface.depth_view import camera_rays
+from p2gs.ops.planes import LEAST_COSINE, planes
+from p2gs.ops.rays import camera_rays
 from p2gs.types import Camera, GaussianTensors
 
-LEAST_COSINE = 0.05  # between a ray and the mean normal along it
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of coordinates, for their products
-
-
-def planes(g: GaussianTensors, eye: Tensor) -> Tensor:
-    """Unit normals [N, 3] of the planes through the Gaussians' middles in which they are densest along rays from
-    ``eye`` [3] past them.
-
-    To first order that is the plane across inverse(covariance) (mean - eye): the flat side of a flat Gaussian, and
-    across the ray for a round one (RaDe-GS, arXiv:2406.01467).
-    """
-    away = g.means - eye
-    R = so3.quat_to_matrix(so3.quat_normalize(g.quats))
-    along = (R.transpose(1, 2) @ away[..., None])[..., 0]
-    sharpest = g.log_scales.amin(1, keepdim=True)  # any common factor will do
-    return torch.nn.functional.normalize(
-        (R @ (along * torch.exp(2 * (sharpest - g.log_scales)))[..., None])[..., 0], dim=1
-    )
 
 
 def surface_depth(g: GaussianTensors, camera: Camera) -> tuple[Tensor, Tensor]:
     """Depth along z [H, W] at which pixels meet the mean of the Gaussians' planes (PGSR, arXiv:2406.06521), 0 where
     nothing is or the plane is seen edge-on; and how far the planes lie about it, as a standard deviation across the
     surface [H, W]."""
-    normal = planes(g, camera.position.to(g.means))
+    normal = planes(g.means, g.quats, g.log_scales, camera.position.to(g.means))[0]
     centre = g.means.mean(0) if len(g) else g.means.new_zeros(3)
     # from planes through the centre: differences of large numbers lose bits
     offset = ((g.means - centre) * normal).sum(1, keepdim=True)

@@ -19,6 +19,7 @@ from p2gs.metrics.views import evaluate_view
 from p2gs.scores import evaluate
 from p2gs.scores.table import score_tables
 from p2gs.surface.mesh import write_meshes
+from p2gs.surface.surface_depth import surface_depth
 from p2gs.types import TwoStateScene, UserError
 
 
@@ -30,7 +31,7 @@ def photograph(state, camera):
 @pytest.fixture(scope="module")
 def scene() -> TwoStateScene:
     base = toy_scene(n=3, size=64, render=photograph)
-    views = [replace(v, depth=draw(pose(toy_twin(), float(v.state)), v.camera).expected_depth) for v in base.views]
+    views = [replace(v, depth=surface_depth(pose(toy_twin(), float(v.state)), v.camera)[0]) for v in base.views]
     return base.with_views(views)
 
 

@@ -15,7 +15,8 @@ from p2gs.gaussians.paint import part_coloured
 from p2gs.gaussians.pose import pose
 from p2gs.gaussians.views import scene_cameras
 from p2gs.ops.mesh import Mesh, largest_components
-from p2gs.surface.depth_view import DepthView, add_normals, camera_rays
+from p2gs.ops.rays import camera_rays
+from p2gs.surface.depth_view import DepthView, add_normals
 from p2gs.surface.mesh import mesh_cameras, part_meshes, read_mesh, write_mesh, write_meshes
 from p2gs.surface.sightings import PartView, beside_others, fog_limit, look, start_motion, trust
 from p2gs.surface.tsdf import ActiveGrid, fuse

@@ -8,8 +8,9 @@ from toy import ring
 
 from p2gs.gaussians.paint import draw
 from p2gs.ops import so3
-from p2gs.surface.depth_view import camera_rays
-from p2gs.surface.surface_depth import planes, surface_depth
+from p2gs.ops.planes import planes
+from p2gs.ops.rays import camera_rays
+from p2gs.surface.surface_depth import surface_depth
 from p2gs.types import GaussianTensors
 
 
@@ -84,7 +85,7 @@ def test_planes_are_where_rays_meet_most():
     scales = torch.tensor([[0.3, 0.1, 0.02]], dtype=torch.float64)
     one = GaussianTensors(mean, quat, scales.log(), torch.zeros(1).double(), torch.zeros(1, 1, 3).double())
     eye = torch.tensor([0.1, 0.2, -0.5], dtype=torch.float64)
-    n = planes(one, eye)[0]
+    n = planes(one.means, one.quats, one.log_scales, eye)[0][0]
     R = so3.quat_to_matrix(quat)[0]
     inverse = R @ torch.diag(scales[0] ** -2) @ R.T
     aside, errors = torch.randn(3, generator=g, dtype=torch.float64), []

@@ -7,7 +7,7 @@ from p2gs.types import UserError
 
 
 def test_what_nobody_makes_is_refused():
-    with pytest.raises(UserError, match="loss Odd: needs 'normals', which no phase makes; known: depth_sq, parts"):
+    with pytest.raises(UserError, match="loss Odd: needs 'normals', which no phase makes; known: depth_sq, planes"):
 
         class Odd(Loss):
             needs = {"normals"}
@@ -33,7 +33,8 @@ def test_the_built_in_ones_declare_what_they_look_at():
     import p2gs.losses  # noqa: F401
 
     own = {name: loss for name, loss in LOSSES.items() if loss.__module__.startswith("p2gs.losses.")}
-    assert {n for n, loss in own.items() if loss.kind == "image"} == {"render", "alpha", "depth"}
+    assert {n for n, loss in own.items() if loss.kind == "image"} == {"render", "alpha", "depth", "surface_depth"}
     assert {n for n, loss in own.items() if "pairs" in loss.needs} == {"art", "velocity", "vector"}
     assert {n for n, loss in own.items() if "depth_sq" in loss.needs} == {"depth_variance"}
+    assert {n for n, loss in own.items() if "planes" in loss.needs} == {"surface_depth"}
     assert all(loss.kind in KINDS and loss.needs <= NEEDS.keys() and loss.kind != "own" for loss in own.values())

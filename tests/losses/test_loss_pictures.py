@@ -9,7 +9,7 @@ from torch.autograd import gradcheck
 
 from p2gs.losses import LOSSES
 from p2gs.losses.base import LossInputs, Target
-from p2gs.types import GaussianTensors, RenderOutput
+from p2gs.types import Camera, GaussianTensors, RenderOutput
 
 F64 = torch.float64
 
@@ -126,16 +126,45 @@ def test_depth_is_logarithmic_over_what_is_known():
 
 def test_depth_leaves_out_what_lies_next_to_a_jump():
     inputs = make_inputs()
-    known, r = inputs.target.depth, inputs.render
-    terms = []
+    r = inputs.render
+    terms = [
+        math.log(1 + abs((r.depth[y, x] / r.alpha[y, x] - inputs.target.depth[y, x]).item()))
+        for y, x in away_from_jumps(inputs, 1.2)
+    ]
+    assert 0 < len(terms) < 60
+    assert LOSSES["depth"](weight=1.0, edge=1.2)(inputs).item() == pytest.approx(sum(terms) / len(terms))
+
+
+def away_from_jumps(inputs, edge):
+    """(row, column) of pixels of known depth that are covered, about which known depth differs by ``edge`` at most."""
+    known, out = inputs.target.depth, []
     for y in range(known.shape[0]):
         for x in range(known.shape[1]):
             around = known[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
             around = around[around > 0]  # what is not known is no jump
-            if known[y, x] > 0 and r.alpha[y, x] > 0.1 and around.max() - around.min() <= 1.2:
-                terms.append(math.log(1 + abs((r.depth[y, x] / r.alpha[y, x] - known[y, x]).item())))
-    assert 0 < len(terms) < 60
-    assert LOSSES["depth"](weight=1.0, edge=1.2)(inputs).item() == pytest.approx(sum(terms) / len(terms))
+            if known[y, x] > 0 and inputs.render.alpha[y, x] > 0.1 and around.max() - around.min() <= edge:
+                out.append((y, x))
+    return out
+
+
+def test_surface_depth_is_where_rays_meet_planes():
+    inputs = make_inputs()
+    h, w = inputs.target.depth.shape
+    K = torch.tensor([[20.0, 0, 8], [0, 21, 7], [0, 0, 1]])
+    facing = torch.tensor([0.4, -0.3, 1.0], dtype=F64)
+    planes = (
+        torch.cat([facing.expand(h, w, 3), 1 + torch.rand(h, w, 1, dtype=F64)], -1) * inputs.render.alpha[..., None]
+    )
+    inputs = replace(inputs, render=replace(inputs.render, features=planes), camera=Camera(torch.eye(4), K, w, h))
+    terms = []
+    for y, x in away_from_jumps(inputs, 1.2):
+        ray = torch.tensor([(x + 0.5 - 8) / 20, (y + 0.5 - 7) / 21, 1], dtype=F64)
+        met = planes[y, x, 3] / (planes[y, x, :3] @ ray)
+        terms.append(math.log(1 + abs((met - inputs.target.depth[y, x]).item())))
+    loss = LOSSES["surface_depth"](weight=1.0, edge=1.2)
+    assert loss(inputs).item() == pytest.approx(sum(terms) / len(terms))
+    assert loss(replace(inputs, render=replace(inputs.render, features=None))) is None
+    assert loss(replace(inputs, target=replace(inputs.target, depth=None))) is None
 
 
 def test_depth_variance_is_twice_its_mean_over_the_foreground():
