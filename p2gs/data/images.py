@@ -45,6 +45,28 @@ def resize_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return image[rows[:, None], cols[None]]
 
 
+def resize_depth(depth: np.ndarray, width: int, height: int) -> np.ndarray:
+    """[height, width] float32: the depth at each new pixel's centre of a map [H, W], 0 where it is not known.
+
+    Inverse depth is linear on a plane: between the pixels about the centre it is interpolated, so that a plane stays
+    where it is (the nearest pixel's centre is half a pixel off where the size is halved). Where one of them is not
+    known, the nearest has its say.
+    """
+    import cv2
+
+    nearest = resize_nearest(depth, width, height).astype(np.float32)
+    known = depth > 0
+    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
+    x, y = (
+        (np.arange(n, dtype=np.float32) + 0.5) * size / n - 0.5
+        for n, size in ((width, depth.shape[1]), (height, depth.shape[0]))
+    )
+    at = np.broadcast_to(x, (height, width)).copy(), np.broadcast_to(y[:, None], (height, width)).copy()
+    maps = (inverse, known.astype(np.float32))
+    mean, share = (cv2.remap(m, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for m in maps)
+    return np.where((share > 1 - 1e-4) & (nearest > 0), 1 / np.maximum(mean, 1e-9), nearest).astype(np.float32)
+
+
 def premultiply(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """[H, W, 4] float32 in 0..255: colour times alpha, and alpha."""
     out = np.empty((*alpha.shape, 4), np.float32)
@@ -249,7 +271,7 @@ def read_view(frame: Frame, report: Report, downscale: float = 1.0, depth: Depth
     if downscale != 1.0:
         w, h = max(1, round(width / downscale)), max(1, round(height / downscale))
         colour, alpha = downscale_rgba(colour, alpha, w, h)
-        z = None if z is None else resize_nearest(z, w, h)
+        z = None if z is None else resize_depth(z, w, h)
         camera = camera.scaled(w, h)
     return View(
         frame.name,

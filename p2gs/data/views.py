@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from p2gs.data.box import mask_bounds
-from p2gs.data.images import premultiply, resize_area, resize_nearest, to_uint8
+from p2gs.data.images import premultiply, resize_area, resize_depth, to_uint8
 from p2gs.ops.pixels import compose
 from p2gs.types import Camera, View
 
@@ -96,6 +96,11 @@ class TrainingViews:
     def __len__(self) -> int:
         return len(self._stored)
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether one of the views has a depth map."""
+        return any(levels[0].depth is not None for levels in self._stored)
+
     def _pyramid(self, view: View, margin: float, align: int, crop: bool) -> list[_Stored]:
         x0, y0, x1, y1 = mask_bounds(view.alpha)
         pixels = np.zeros((view.camera.height, view.camera.width, 4), np.float32)
@@ -111,7 +116,7 @@ class TrainingViews:
         width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
         if (width, height) != (camera.width, camera.height):
             pixels = resize_area(pixels, width, height)
-            depth = None if depth is None else resize_nearest(depth, width, height)
+            depth = None if depth is None else resize_depth(depth, width, height)
             camera = camera.scaled(width, height)
         x, y, w, h = 0, 0, width, height
         if crop:

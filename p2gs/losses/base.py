@@ -30,7 +30,7 @@ from p2gs.types import Camera, GaussianTensors, RenderOutput, UserError
 LOSSES: Registry[type["Loss"]] = Registry("loss")
 NEEDS = {
     "depth_sq": "RenderOutput.depth_sq",
-    "planes": "RenderOutput.features: ops.planes.plane_features",
+    "planes": "RenderOutput.features: ops.planes.plane_features, where photographs have depth maps",
     "parts": "LossInputs.parts",
     "pairs": "PartState.pairs, mu0, mu1: without observed pairs the loss is nothing",
     "rotations": "PartState.target_rotation",

@@ -95,6 +95,7 @@ class ImagePhase(Phase):
     def __init__(self, config: ImageConfig, losses: dict[str, Loss], views: dict[int, TrainingViews], **common):
         super().__init__(config, losses, **common)
         self.views = views
+        self.measured = any(v.has_depth for v in views.values())
 
     def level(self, step: int) -> int:
         """Image size (long edge) at a step."""
@@ -141,7 +142,7 @@ class ImagePhase(Phase):
             background,
             sh_degree=sh_degree,
             depth_sq=self.needed("depth_sq"),
-            planes=self.needed("planes"),
+            planes=self.measured and self.needed("planes"),
             absgrad=self.track_gradients,
             backend=self.rasterizer,
         )

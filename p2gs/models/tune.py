@@ -104,7 +104,8 @@ def tune(
         target = Target(shot.image.to(device), shot.alpha.to(device), background, depth, view=shot.key)
         g = splats.tensors()
         posed = g.placed(*moves[state](g.means, g.quats))
-        made = {what: any(what in loss.needs for loss in losses.values()) for what in ("depth_sq", "planes")}
+        wanted = {what for loss in losses.values() for what in loss.needs}
+        made = {"depth_sq": "depth_sq" in wanted, "planes": depth is not None and "planes" in wanted}
         render = render_gaussians(posed, camera, background, backend=backend, **made)
         inputs = LossInputs(step, config.steps, g, render, target, camera, cache=cache)
         values = [value for value in (loss(inputs) for loss in losses.values()) if value is not None]

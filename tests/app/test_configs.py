@@ -77,9 +77,14 @@ def test_the_literal_preset_has_nothing_of_the_default_that_the_paper_has_not():
     assert articulation.config.repel.render and art.variant == "paper" and art.lambda_rot == 0.1
     for name in ("single_state", "canonical_fusion", "articulation"):
         phase = literal.phases[name]
-        assert len(phase.config.levels) == 1 and not {"alpha", "depth", "depth_variance", "flat", "planar"} & set(
-            phase.losses
-        )
+        assert len(phase.config.levels) == 1 and not {
+            "alpha",
+            "depth",
+            "surface_depth",
+            "depth_variance",
+            "flat",
+            "planar",
+        } & set(phase.losses)
     densify = literal.phases["single_state"].callbacks["densify"]
     assert densify.budget is None and densify.threshold > 0 and densify.reset_every == 3000
     canonical = literal.phases["canonical_fusion"].config.canonical
@@ -94,7 +99,9 @@ def test_the_literal_preset_has_nothing_of_the_default_that_the_paper_has_not():
 def test_depth_is_in_the_depth_preset_alone():
     paper, depth = load_config(["preset/paper.yaml"]), load_config(["preset/paper_depth.yaml"])
     trained = ("single_state", "sharpen", "canonical_fusion", "articulation")
-    assert not any("depth" in paper.phases[n].losses for n in trained) and paper.data_options["depth"] == "never"
+    assert not any({"depth", "surface_depth"} & set(paper.phases[n].losses) for n in trained)
+    assert not any("surface_depth" in depth.phases[n].losses for n in trained)
+    assert paper.data_options["depth"] == "never"
     assert (
         all(depth.phases[n].losses["depth"].weight == 1.0 for n in trained) and depth.data_options["depth"] == "always"
     )

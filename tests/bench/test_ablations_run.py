@@ -120,7 +120,7 @@ def test_two_steps_of_every_ablation(name, preset, scene, tmp_path):
     if phase.total_steps == 0:
         return
     wanted = {n for n, loss in phase.losses.items() if loss.active(1, 2) or loss.active(0, 2)}
-    wanted -= {"depth"}  # no depth maps at hand
+    wanted -= {"depth", "surface_depth"}  # no depth maps at hand
     assert wanted <= {n.removeprefix("loss/") for n in phase.scalars}, "a loss that is switched on never applied"
     if name.startswith("k_"):
         assert learned.probs.shape[1] == pipe.cfg.num_parts

@@ -41,7 +41,7 @@ def test_every_loss_is_in_one_chart_of_its_kind():
     tags = [tag for _, group in charts.values() for tag in group]
     assert sorted(tags) == sorted(f"^articulation/loss/{name}$" for name in [*losses, "total"])
     assert charts["image"][1] == [
-        f"^articulation/loss/{name}$" for name in losses if name in ("render", "alpha", "depth")
+        f"^articulation/loss/{name}$" for name in losses if name in ("render", "alpha", "depth", "surface_depth")
     ]
     assert charts["physics"][1] == ["^articulation/loss/velocity$", "^articulation/loss/contact$"]
     assert "articulation: joints" not in layout("single_state_0", losses)

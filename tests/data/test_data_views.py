@@ -9,7 +9,7 @@ from lightning.pytorch import LightningModule, Trainer
 
 from p2gs.data.base import TwoStateData, Visit
 from p2gs.data.box import farthest_cameras, mask_bounds
-from p2gs.data.images import downscale_rgba, resize_nearest
+from p2gs.data.images import downscale_rgba, resize_depth, resize_nearest
 from p2gs.data.views import TrainingViews, crop_window, view_index
 from p2gs.types import Camera, View
 
@@ -164,6 +164,29 @@ def test_nearest_takes_the_pixel_under_the_centre():
     image = np.arange(6 * 9).reshape(6, 9)
     assert np.array_equal(resize_nearest(image, 3, 2), image[1::3, 1::3])
     assert np.array_equal(resize_nearest(image, 18, 12)[::2, 1::2], image)
+
+
+@pytest.mark.parametrize("size", [(40, 30), (20, 15), (10, 7), (13, 11), (80, 60)])
+def test_depth_of_a_plane_stays_where_the_plane_is(size):
+    def plane(width, height):  # inverse depth is linear in place
+        y, x = np.mgrid[:height, :width] + 0.5
+        return 1 / (0.3 + 0.2 * x / width - 0.1 * y / height)
+
+    depth = resize_depth(plane(40, 30).astype(np.float32), *size)
+    inside = (
+        (slice(1, -1), slice(1, -1)) if size[0] > 40 else ()
+    )  # beyond the outermost pixels' centres nothing is known
+    np.testing.assert_allclose(depth[inside], plane(*size)[inside], rtol=3e-4)
+
+
+def test_depth_beside_the_unknown_is_the_nearest():
+    depth = np.full((6, 8), 2.0, np.float32)
+    depth[:, :3] = 0
+    depth[:, 6:] = 4
+    half = resize_depth(depth, 4, 3)
+    assert np.array_equal(half, resize_nearest(depth, 4, 3)) and sorted(set(half.ravel())) == [0, 2, 4]
+    depth[:, 5:] = 4  # two surfaces in one new pixel: neither is nearer to its centre
+    np.testing.assert_allclose(resize_depth(depth, 4, 3)[:, 2], 1 / ((1 / 2 + 1 / 4) / 2), rtol=1e-6)
 
 
 def test_crop_holds_the_mask_and_its_camera_sees_the_same():

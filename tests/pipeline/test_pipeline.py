@@ -113,7 +113,7 @@ def test_everything_that_can_be_null(folder, tmp_path):
     ]
     words += [
         f"--phases.articulation.losses.{n}=null"
-        for n in ("alpha", "depth_variance", "depth", "part", "art", "contact", "velocity", "vector")
+        for n in ("alpha", "depth_variance", "surface_depth", "part", "art", "contact", "velocity", "vector")
     ]
     done = fit(folder, "--run", str(tmp_path / "bare"), *words)
     assert done.returncode == 0, done.stderr
