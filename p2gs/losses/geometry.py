@@ -39,7 +39,7 @@ class Depth(Loss):
 
 
 @register_loss("surface_depth")
-class SurfaceDepth(Depth):
+class SurfaceDepth(Loss):
     """``depth`` of the surface: where rays meet the Gaussians' planes (``ops.planes.plane_error``), of which meshes are
     made, too. Not in the paper; None without depth maps.
 
@@ -49,6 +49,7 @@ class SurfaceDepth(Depth):
     needs = frozenset({"planes"})
     kind = "image"
     weight: float = 10.0
+    min_alpha: float = 0.1
     edge: float | None = 0.1
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
