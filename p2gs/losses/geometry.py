@@ -11,6 +11,7 @@ from p2gs.ops.pixels import depth_range, depth_spread
 from p2gs.ops.planar import hidden_bends
 from p2gs.ops.planes import plane_error
 from p2gs.ops.rays import camera_rays
+from p2gs.types import RenderOutput
 
 
 @register_loss("depth")
@@ -31,10 +32,11 @@ class Depth(Loss):
     edge: float | None = None
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
-        known, counted = _known_depth(inputs, self.min_alpha, self.edge)
-        if known is None or inputs.render is None:
+        found = _known_depth(inputs, self.min_alpha, self.edge)
+        if found is None:
             return None
-        error = torch.where(counted, (inputs.render.expected_depth - known).abs(), torch.zeros_like(known))
+        render, known, counted = found
+        error = torch.where(counted, (render.expected_depth - known).abs(), torch.zeros_like(known))
         return error.log1p().sum() / counted.sum().clamp_min(1)
 
 
@@ -53,19 +55,23 @@ class SurfaceDepth(Loss):
     edge: float | None = 0.1
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
-        known, counted = _known_depth(inputs, self.min_alpha, self.edge)
-        if known is None or inputs.render is None or inputs.render.features is None or inputs.camera is None:
+        found = _known_depth(inputs, self.min_alpha, self.edge)
+        if found is None or found[0].features is None or inputs.camera is None:
             return None
-        return plane_error(inputs.render.features, camera_rays(inputs.camera).to(known.device), known, counted)
+        render, known, counted = found
+        return plane_error(render.painted, camera_rays(inputs.camera).to(known.device), known, counted)
 
 
-def _known_depth(inputs: LossInputs, min_alpha: float, edge: float | None) -> tuple[Tensor | None, Tensor]:
-    """The target's depth map [H, W], None without one, and the pixels [H, W] bool at which it counts (``Depth``)."""
+def _known_depth(
+    inputs: LossInputs, min_alpha: float, edge: float | None
+) -> tuple[RenderOutput, Tensor, Tensor] | None:
+    """The render, the target's depth map [H, W] and the pixels [H, W] bool at which it counts (``Depth``); None without
+    a map."""
     render, target = inputs.render, inputs.target
     if render is None or target is None or target.depth is None:
-        return None, torch.zeros(0, dtype=torch.bool)
+        return None
     counted = (target.depth > 0) & (render.alpha.detach() > min_alpha)
-    return target.depth, counted if edge is None else counted & (_jumps(inputs) <= edge)
+    return render, target.depth, counted if edge is None else counted & (_jumps(inputs) <= edge)
 
 
 def _jumps(inputs: LossInputs) -> Tensor:

@@ -15,8 +15,10 @@ def camera_rays(camera: Camera) -> Tensor:
     return _rays(tuple(camera.K.double().flatten().tolist()), camera.width, camera.height)
 
 
-@lru_cache(maxsize=2)  # the views of a scene mostly share their intrinsics
+# whole views of a scene mostly share their intrinsics; training crops each in its own way, so it must be quick, too
+@lru_cache(maxsize=2)
 def _rays(K: tuple[float, ...], width: int, height: int) -> Tensor:
-    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    pixels = torch.stack([u, v, torch.ones_like(u)], -1).double()
-    return (pixels @ torch.linalg.inv(torch.tensor(K, dtype=torch.float64).reshape(3, 3)).T).float()
+    right, down, first = torch.linalg.inv(torch.tensor(K, dtype=torch.float64).reshape(3, 3)).T
+    columns = (torch.arange(width).double() + 0.5)[:, None] * right + first
+    rows = (torch.arange(height).double() + 0.5)[:, None] * down
+    return (columns + rows[:, None]).float()

@@ -139,7 +139,9 @@ def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]
             continue
         gaussians, quality = pose(obj, float(state)), ViewQuality()
         for view in views:
-            planes = plane_features(gaussians.means, gaussians.quats, gaussians.log_scales, view.camera)
+            planes = None  # for depth alone
+            if view.depth is not None:
+                planes = plane_features(gaussians.means, gaussians.quats, gaussians.log_scales, view.camera)
             quality.update(draw(gaussians, view.camera, 0.0, features=planes), view, diagonal)
         out[name] = {"split": split, "count": len(views)} | quality.means()
     why = why_absent() if out and lpips_wanted() else None

@@ -173,9 +173,8 @@ def test_depth_of_a_plane_stays_where_the_plane_is(size):
         return 1 / (0.3 + 0.2 * x / width - 0.1 * y / height)
 
     depth = resize_depth(plane(40, 30).astype(np.float32), *size)
-    inside = (
-        (slice(1, -1), slice(1, -1)) if size[0] > 40 else ()
-    )  # beyond the outermost pixels' centres nothing is known
+    # beyond the outermost pixels' centres nothing is known
+    inside = (slice(1, -1), slice(1, -1)) if size[0] > 40 else ()
     np.testing.assert_allclose(depth[inside], plane(*size)[inside], rtol=3e-4)
 
 

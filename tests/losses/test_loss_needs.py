@@ -7,7 +7,9 @@ from p2gs.types import UserError
 
 
 def test_what_nobody_makes_is_refused():
-    with pytest.raises(UserError, match="loss Odd: needs 'normals', which no phase makes; known: depth_sq, planes"):
+    with pytest.raises(
+        UserError, match="loss Odd: needs 'normals', which no phase makes; known: depth_sq, planes, parts"
+    ):
 
         class Odd(Loss):
             needs = {"normals"}
