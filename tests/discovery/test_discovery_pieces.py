@@ -15,10 +15,10 @@ from p2gs.data.generated.articulated import SyntheticPart, revolute
 from p2gs.data.generated.furniture import box
 from p2gs.motion.discovery.amounts import parted
 from p2gs.motion.discovery.config import DiscoveryConfig
-from p2gs.motion.discovery.explanations import ranked, total_score
+from p2gs.motion.discovery.explanations import extended, finish, ranked, total_score
 from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.discovery.finish import Explanation
-from p2gs.motion.discovery.hypotheses import Sweep, static_axes
+from p2gs.motion.discovery.hypotheses import Sweep, static_axes, sweep
 from p2gs.motion.discovery.labels import ELSEWHERE, REVEALED, Graph, Labelling, arrivals, label, unary, unlike
 from p2gs.motion.discovery.pipeline import discover
 from p2gs.motion.discovery.problem import build_problem, evidence_masks, resampled
@@ -139,6 +139,22 @@ def test_stacked_doors_are_two_amounts_about_one_axis(stacked):
     assert min(scores) < alone and float((best.axis[0] @ truth.axis[0]).abs()) > 0.9999
     off = (best.amount.abs().sort().values - truth.amount.abs()).abs() * 180 / math.pi
     assert float(off.max()) < 1.5
+
+
+def test_a_part_that_the_search_did_without_is_added_and_no_more(stacked):
+    problem, graphs, _, truth = stacked
+    axes = static_axes(problem)
+    search = Search(problem, sweep(problem, axes[:1]), 4, problem.config.part_cost)
+    near = replace(truth, amount=truth.amount * torch.tensor([1.05, 0.95]))
+    search.pool.add(Motions.cat([near, random_motions(6)]))
+    one = finish(problem, graphs, near[:1], 4, axes)
+    assert len(one.motions) == 1
+    both = extended(problem, graphs, search, one, 4, axes)
+    assert len(both.motions) == 2 and both.score < one.score
+    off = (both.motions.amount.abs().sort().values - truth.amount.abs()).abs() * 180 / math.pi
+    assert float(off.max()) < 1.5
+    assert extended(problem, graphs, search, both, 4, axes) is both
+    assert extended(problem, graphs, search, one, 1, axes) is one  # no more than the limit
 
 
 def test_one_door_stays_one():

@@ -30,6 +30,28 @@ def finish(problem: Problem, graphs: list[Graph], motions: Motions, limit: int, 
     return prune(problem, graphs, motions, labelling, limit, axes)
 
 
+def extended(
+    problem: Problem, graphs: list[Graph], search: Search, found: Explanation, limit: int, axes: Tensor
+) -> Explanation:
+    """Parts added, up to ``limit``, while the score falls: of the motions of the pool that promise most for what is
+    left over the one with which, all fitted and labelled anew, it falls most.
+
+    The search values a set by what its motions explain where they are, and may do without one that they come near.
+    """
+    while 0 < len(found.motions) < limit:
+        best = found
+        for _, more in search.additions(search.pool.add(found.motions).tolist()):
+            added = Motions.cat([found.motions, search.pool.motions[torch.tensor(more[-1:])]])
+            motions, labelling = settle_parts(problem, graphs, added, axes)
+            score = total_score(problem, motions, labelling)
+            if len(motions) > len(found.motions) and score < best.score:
+                best = Explanation(motions, labelling, score)
+        if best is found:
+            break
+        found = best
+    return found
+
+
 def divided(problem: Problem, graphs: list[Graph], found: Explanation, limit: int, axes: Tensor) -> Explanation:
     """Parts made two by amounts of their own about one axis (``parted``), up to ``limit`` parts, while the score
     falls."""

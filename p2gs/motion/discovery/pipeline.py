@@ -10,7 +10,7 @@ from torch import Tensor
 
 from p2gs.motion.discovery.config import DiscoveryConfig
 from p2gs.motion.discovery.describe import describe, nearest_evidence
-from p2gs.motion.discovery.explanations import again, divided, finish, ranked
+from p2gs.motion.discovery.explanations import again, divided, extended, finish, ranked
 from p2gs.motion.discovery.finish import Explanation
 from p2gs.motion.discovery.hypotheses import directions, static_axes, sweep
 from p2gs.motion.discovery.labels import Graph, Labelling
@@ -73,7 +73,9 @@ def discover(
         explanations = at_once(lambda motions: finish(problem, graphs, motions, limit, still), sets)
         explanations += again(problem, graphs, search, explanations, limit, still)
         explanations = ranked(search, explanations)
-        best = at_once(lambda e: divided(problem, graphs, e, limit, still), explanations[: config.candidates])
+        # one after another, as additions join the pool
+        best = [extended(problem, graphs, search, e, limit, still) for e in explanations[: config.candidates]]
+        best = at_once(lambda e: divided(problem, graphs, e, limit, still), best)
         explanations = ranked(search, best + explanations[config.candidates :])
         lap("labels", 0.95)
     if not explanations:
