@@ -34,20 +34,11 @@ from p2gs.motion.joint_confidence import JointEvidence, common_level, features, 
 from p2gs.motion.refine_motions import Judge, refine, single_ways
 from p2gs.motion.relabel import label_gaussians
 from p2gs.ops import se3
-from p2gs.visibility.evidence import gather_evidence
 
 
 def searched(case: Case) -> SimpleNamespace:
     """Discovery's problem and search, of the states as discovery sees them."""
-    config, options = (
-        case.cfg.phases["discovery"].config,
-        {"backend": case.cfg.rasterizer, "device": case.pipeline.device},
-    )
-    train = [case.scene.select(state=s.state, split="train") for s in case.states]
-    seen = [
-        gather_evidence(s.gaussians, v, config.evidence_size, config.min_opacity, **options)
-        for s, v in zip(case.states, train, strict=True)
-    ]
+    config, seen = case.cfg.phases["discovery"].config, case.evidence()
     problem = build_problem(*seen, config.search, case.cfg.seed)[0]
     swept = sweep(problem, directions(problem))
     search = Search(problem, swept, config.search.max_parts - 1, config.search.part_cost)

@@ -10,11 +10,10 @@ to 1) and turn (degrees) away from the truth; energies.
 
 from __future__ import annotations
 
-import json
 from types import SimpleNamespace
 
 import torch
-from ladder import Case, runs_parser, to_training
+from ladder import Case, runs_parser, to_training, write_rows
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.discovery import discover, relabel
@@ -23,7 +22,6 @@ from p2gs.motion.discovery.problem import build_problem
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.relabel import label_gaussians
 from p2gs.ops import se3
-from p2gs.visibility.evidence import gather_evidence
 
 
 def true_motions(case: Case) -> tuple[torch.Tensor, list[str]]:
@@ -64,16 +62,7 @@ def gates(case: Case, search: bool) -> dict:
     """A run's line."""
     config, views = case.cfg.phases["discovery"].config, case.pipeline.views
     options = {"backend": case.cfg.rasterizer, "device": case.pipeline.device}
-    seen = [
-        gather_evidence(
-            s.gaussians,
-            case.scene.select(state=s.state, split="train"),
-            config.evidence_size,
-            config.min_opacity,
-            **options,
-        )
-        for s in case.states
-    ]
+    seen = case.evidence()
     truth, types = true_motions(case)
     if search:
         found = discover(*seen, case.cfg.num_parts, config.search, case.cfg.seed)
@@ -100,13 +89,7 @@ def main() -> None:
     parser = runs_parser(__doc__.splitlines()[0])
     parser.add_argument("--search", action="store_true", help="also the energies; needs the time of two discoveries")
     args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    for run in args.runs:
-        line = json.dumps(gates(Case(run, args.zoo), args.search))
-        print(line, flush=True)
-        if args.out:
-            with args.out.open("a") as f:
-                f.write(line + "\n")
+    write_rows(args, lambda case: gates(case, args.search))
 
 
 if __name__ == "__main__":

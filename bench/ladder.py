@@ -17,6 +17,7 @@ import math
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Callable
 
 import numpy as np
 import torch
@@ -32,6 +33,7 @@ from p2gs.models.part_discovery import find_part_motions
 from p2gs.models.registered import correct_scene, register_state, register_views
 from p2gs.ops import se3
 from p2gs.runtime.pipeline import Pipeline
+from p2gs.visibility.evidence import gather_evidence
 
 RIGHT = {"axis_angle": 1.0, "axis_position": 0.15, "turn": 1.0, "slide": 0.01}  # the field's bounds of a right joint
 
@@ -154,6 +156,13 @@ class Case:
             rows.append({"joint": s.gt, "type": s.type, "pred": s.pred, "right": good, "errors": errors})
         return {"right": sum(r["right"] for r in rows), "of": len(rows), "extra": len(report.extra), "joints": rows}
 
+    def evidence(self) -> list:
+        """What discovery looks at of both states."""
+        config = self.cfg.phases["discovery"].config
+        options = (config.evidence_size, config.min_opacity, self.cfg.rasterizer, self.pipeline.device)
+        views = [self.scene.select(state=s.state, split="train") for s in self.states]
+        return [gather_evidence(s.gaussians, v, *options) for s, v in zip(self.states, views, strict=True)]
+
     def discover(self, report=None):
         """Discovery as a run does it. Returns PartMotions and seconds."""
         clock = time.perf_counter()
@@ -180,6 +189,17 @@ def runs_parser(about: str) -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--threads", type=int, default=1)
     return parser
+
+
+def write_rows(args: argparse.Namespace, row_of: Callable[[Case], dict]) -> None:
+    """A line of JSON per run, printed and, where asked for, written."""
+    torch.set_num_threads(args.threads)
+    for run in args.runs:
+        line = json.dumps(row_of(Case(run, args.zoo)))
+        print(line, flush=True)
+        if args.out:
+            with args.out.open("a") as f:
+                f.write(line + "\n")
 
 
 def main() -> None:

@@ -12,15 +12,12 @@ wins) of the true set and of each explanation.
 
 from __future__ import annotations
 
-import json
-
 import torch
 from gates import true_motions
-from ladder import Case, runs_parser
+from ladder import Case, runs_parser, write_rows
 
 from p2gs.motion.discovery import as_motions, discover, surface_energy
 from p2gs.motion.discovery.rigid import Motions
-from p2gs.visibility.evidence import gather_evidence
 
 FIRST = 96, 16  # motions looked at and kept, as ``Search.fill`` has it
 
@@ -34,18 +31,7 @@ def nearest(truth: Motions, probe: torch.Tensor, motions: Motions) -> float | No
 def steps(case: Case) -> dict:
     """A run's line."""
     config = case.cfg.phases["discovery"].config
-    seen = [
-        gather_evidence(
-            s.gaussians,
-            case.scene.select(state=s.state, split="train"),
-            config.evidence_size,
-            config.min_opacity,
-            case.cfg.rasterizer,
-            case.pipeline.device,
-        )
-        for s in case.states
-    ]
-    found = discover(*seen, case.cfg.num_parts, config.search, case.cfg.seed)
+    found = discover(*case.evidence(), case.cfg.num_parts, config.search, case.cfg.seed)
     transforms, types = true_motions(case)
     explained = [round(surface_energy(found, *_of(c.motions)), 4) for c in found.candidates if c.motions]
     row: dict = {"name": case.name, "energy": [round(surface_energy(found, transforms, types), 4), explained]}
@@ -71,14 +57,7 @@ def _of(motions: list) -> tuple[torch.Tensor, list[str]]:
 
 
 def main() -> None:
-    args = runs_parser(__doc__.splitlines()[0]).parse_args()
-    torch.set_num_threads(args.threads)
-    for run in args.runs:
-        line = json.dumps(steps(Case(run, args.zoo)))
-        print(line, flush=True)
-        if args.out:
-            with args.out.open("a") as f:
-                f.write(line + "\n")
+    write_rows(runs_parser(__doc__.splitlines()[0]).parse_args(), steps)
 
 
 if __name__ == "__main__":
