@@ -5,9 +5,9 @@
 RUN holds the single states of a scene (``p2gs fit ... --only registration``). The search on surfaces is run anew, with
 this build's defaults. A line of JSON per run goes to FILE: for each true joint, how far from it (rms displacement of
 the moved surface, internal units) is the nearest motion that was swept ("swept"), of those proposed once all other true
-motions are known ("last") and first of all ("first"), and of the pool that the search ends with ("pool"). And the
-search's value (high wins) of the true set and of its best one with the number of parts, and the surfaces' energy (low
-wins) of the true set and of each explanation.
+motions are known ("last") and first of all ("first"), and of the pool in the end, with what explanations fitted added
+to it ("pool"). And the search's value (high wins) of the true set and of its best one with the number of parts, and
+the surfaces' energy (low wins) of the true set and of each explanation.
 """
 
 from __future__ import annotations
