@@ -9,7 +9,6 @@ from torch import Tensor
 from p2gs.motion.discovery.amounts import parted
 from p2gs.motion.discovery.finish import Explanation, settle_parts
 from p2gs.motion.discovery.labels import Graph, Labelling, label
-from p2gs.motion.discovery.pool import plausibility
 from p2gs.motion.discovery.problem import Problem
 from p2gs.motion.discovery.rigid import Motions, axes_used, without
 from p2gs.motion.discovery.search import Search
@@ -118,23 +117,13 @@ def prune(
 
 
 def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> float:
-    """Image-space violation, the price of the parts and half of the moved surface that hangs on implausible joints.
-    Lower is better.
+    """Image-space violation and the price of the parts. Lower is better.
 
     A further slide along the very direction of another costs a third: of its three freedoms it takes one.
     """
-    if not len(motions):
-        return image_score(problem, motions, labelling)
-    pays = [p for p, _ in problem.pay(motions)]
-    doubt = float(
-        (
-            torch.tensor(masses(problem, labelling))
-            * (1 - plausibility(problem, motions, pays, problem.samples, False))
-        ).sum()
-    )
     axes = axes_used(motions)
     price = problem.config.part_cost * (axes + (len(motions) - axes) / 3)
-    return image_score(problem, motions, labelling) + price + 0.5 * doubt
+    return image_score(problem, motions, labelling) + price
 
 
 def twins(problem: Problem, motions: Motions, labelling: Labelling) -> int | None:

@@ -31,8 +31,7 @@ class FoundMotion:
 
 @dataclass
 class Candidate:
-    """A complete explanation. score: lower is better (image-space violation plus the price of parts and implausible
-    joints).
+    """A complete explanation. score: lower is better (image-space violation plus the price of parts).
 
     probability: per state [M, K + 1] over the state's surfels (column 0 static).
     """

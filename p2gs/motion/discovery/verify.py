@@ -3,6 +3,8 @@ shows there."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
@@ -29,6 +31,32 @@ def light_of(problem: Problem, motions: Motions, labelling: Labelling) -> Turned
     return turned_light(points, normals, colours, labels, transforms, motions.turn.tolist(), reach, alike=True)
 
 
+@dataclass
+class Met:
+    """What labelled surfels [M] of a state meet in the other one.
+
+    through: share of the views that nothing in front blocks which see through the place.  shown: is there such a view.
+    own: does a surface lie there that came from the same place.  like: has some such surface its colour, or is it the
+    plate's other side (``other_side``), whose colours tell nothing.  lost: moved, but called static.
+    """
+
+    through: Tensor
+    shown: Tensor
+    own: Tensor
+    like: Tensor
+    other_side: Tensor
+    lost: Tensor
+
+    def cost(self) -> Tensor:
+        """Cost [M] in 0..1: ``WRONG`` where the place is empty, what lies there is another's or of another colour, or
+        the point is lost; where all views are blocked ``Landing.HIDDEN``, or by the plate's other side
+        ``Landing.TWO_SIDED``."""
+        shown = self.through + (1 - self.through) * torch.where(self.like, 0.0, WRONG)
+        hidden = torch.where(self.other_side, Landing.TWO_SIDED, Landing.HIDDEN)
+        cost = torch.where(self.shown, shown, hidden.to(shown))
+        return torch.where(self.lost, torch.full_like(cost, WRONG), cost)
+
+
 def violation(
     problem: Problem,
     motions: Motions,
@@ -38,11 +66,21 @@ def violation(
     views: int = 32,
     light: TurnedLight | None = None,
 ) -> Tensor:
-    """Cost [M] in 0..1 of the labelled surfels ``index`` [M] of ``state``: the share of the other state's views that
-    see through where a point is predicted, of those not blocked by something in front; where they see a surface that
-    came from elsewhere or has another colour, as wrong as empty space (of a plate's other side, ``motions.thick`` away,
-    colours tell nothing); where all are blocked ``Landing.HIDDEN``, or by the plate's other side ``Landing.TWO_SIDED``.
-    A moved point that is called static is wrong. light: of ``light_of``, if it is known."""
+    """``Met.cost`` [M] of the labelled surfels ``index`` [M] of ``state``; arguments as of ``meetings``."""
+    return meetings(problem, motions, labelling, state, index, views, light).cost()
+
+
+def meetings(
+    problem: Problem,
+    motions: Motions,
+    labelling: Labelling,
+    state: int,
+    index: Tensor,
+    views: int = 32,
+    light: TurnedLight | None = None,
+) -> Met:
+    """What the labelled surfels ``index`` [M] of ``state`` meet in the other state, asked in up to ``views`` views.
+    light: of ``light_of``, if it is known."""
     light = light_of(problem, motions, labelling) if light is None else light
     surf, stack, other = problem.surfels[state], problem.stacks[1 - state], problem.surfels[1 - state]
     labels = labelling.labels(state)[index]
@@ -61,23 +99,25 @@ def violation(
     own = same & (d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None])
     other_side = own & ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
     coloured = (other.colours[j] - colours[:, None]).abs().mean(2) < problem.config.recoloured
-    like = other_side | (own & coloured)
-    through = free / (free + on).clamp_min(1)
-    shown = through + (1 - through) * torch.where(like.any(1), 0.0, WRONG)
-    hidden = torch.where(other_side.any(1), Landing.TWO_SIDED, Landing.HIDDEN)
-    cost = torch.where(free + on > 0, shown, hidden.to(free))
-    return torch.where((labels == 0) & problem.moved[state][index], torch.full_like(cost, WRONG), cost)
+    return Met(
+        through=free / (free + on).clamp_min(1),
+        shown=free + on > 0,
+        own=own.any(1),
+        like=(other_side | (own & coloured)).any(1),
+        other_side=other_side.any(1),
+        lost=(labels == 0) & problem.moved[state][index],
+    )
 
 
 def image_score(problem: Problem, motions: Motions, labelling: Labelling) -> float:
-    """Mean violation over the points that moved or are said to move, of both states together: 0 is a perfect
-    explanation."""
+    """Violation of the points that moved or are said to move, of both states together, over the weight of those that
+    moved: 0 is a perfect explanation, and saying of more points that they move makes it no better."""
     total = mass = 0.0
     light = light_of(problem, motions, labelling)
     for s in (0, 1):
+        mass += float(problem.trust[s][problem.moved[s]].sum())
         index = (problem.moved[s] | (labelling.labels(s) > 0)).nonzero()[:, 0]
         if len(index):
             w = torch.where(problem.moved[s], problem.trust[s], torch.full_like(problem.trust[s], STILL))[index]
             total += float((violation(problem, motions, labelling, s, index, light=light) * w).sum())
-            mass += float(w.sum())
     return total / mass if mass else 0.0
