@@ -16,6 +16,7 @@ from p2gs.motion.discovery.rigid import Motions, same_place
 from p2gs.motion.light import TurnedLight, turned_light
 
 WRONG = 1.0  # cost of a point that something contradicts; hidden space costs what it does where motions are searched
+VIEWS = 32  # of the other state that are asked, at most
 NEIGHBOURS = 6  # surfels of the other state where a point lands, one of which must have come from the same place
 # weight of a point that is said to move but is not known to: its error is the neighbour's rather than the motion's
 STILL = 0.3
@@ -63,11 +64,10 @@ def violation(
     labelling: Labelling,
     state: int,
     index: Tensor,
-    views: int = 32,
     light: TurnedLight | None = None,
 ) -> Tensor:
     """``Met.cost`` [M] of the labelled surfels ``index`` [M] of ``state``; arguments as of ``meetings``."""
-    return meetings(problem, motions, labelling, state, index, views, light).cost()
+    return meetings(problem, motions, labelling, state, index, light).cost()
 
 
 def meetings(
@@ -76,11 +76,10 @@ def meetings(
     labelling: Labelling,
     state: int,
     index: Tensor,
-    views: int = 32,
     light: TurnedLight | None = None,
 ) -> Met:
-    """What the labelled surfels ``index`` [M] of ``state`` meet in the other state, asked in up to ``views`` views.
-    light: of ``light_of``, if it is known."""
+    """What the labelled surfels ``index`` [M] of ``state`` meet in the other state. light: of ``light_of``, if it is
+    known."""
     light = light_of(problem, motions, labelling) if light is None else light
     surf, stack, other = problem.surfels[state], problem.stacks[1 - state], problem.surfels[1 - state]
     labels = labelling.labels(state)[index]
@@ -92,7 +91,7 @@ def meetings(
         n[mine], thick[mine] = motion.rotate(n[mine], inverse=state == 1)[0], motion.thick
     gains = light.gains(labels, n if state else surf.normals[index])
     colours *= (1 / gains if state else gains)[:, None]
-    free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(views))
+    free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(VIEWS))
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
     d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
     same = same_place(places, x, problem.scale.apart).gather(1, labelling.labels(1 - state)[j])
