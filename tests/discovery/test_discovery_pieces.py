@@ -27,7 +27,7 @@ from p2gs.motion.discovery.refine import pattern_search
 from p2gs.motion.discovery.rigid import Motions, axes_used, same_place
 from p2gs.motion.discovery.rows import rows
 from p2gs.motion.discovery.search import Search
-from p2gs.motion.discovery.verify import light_of, violation
+from p2gs.motion.discovery.verify import image_score, light_of, violation
 from p2gs.motion.light import TurnedLight
 from p2gs.visibility.depth_stack import DepthStack, classify
 from p2gs.visibility.surfels import Surfels, window_planes
@@ -181,6 +181,16 @@ def test_where_a_part_lands_on_another_it_is_as_wrong_as_in_empty_space(stacked)
     lost = Labelling([torch.eye(3)[torch.zeros(len(p), dtype=torch.long)] for p in right.probability], right.cost)
     moved = problem.moved[1].nonzero()[:, 0]
     assert bool((violation(problem, truth, lost, 1, moved) == 1).all())  # what moved is called static
+
+
+def test_that_more_is_said_to_move_makes_an_explanation_no_better(stacked):
+    problem, graphs, tilted, _ = stacked
+    still = Motions(tilted.turn, tilted.axis, tilted.centre, torch.zeros(1))
+    motions, wrong = Motions.cat([tilted, still]), label(problem, tilted, graphs)
+    nobody = [torch.cat([p, torch.zeros(len(p), 1)], 1) for p in wrong.probability]
+    everybody = [torch.cat([torch.zeros(len(p), 1), p[:, 1:], p[:, :1]], 1) for p in wrong.probability]
+    few, many = (image_score(problem, motions, Labelling(p, wrong.cost)) for p in (nobody, everybody))
+    assert few > 0.02 and many >= few - 1e-6
 
 
 def test_a_door_that_turned_out_of_the_light_is_no_contradiction(stacked):

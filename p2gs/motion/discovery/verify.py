@@ -59,37 +59,27 @@ class Met:
 
 
 def violation(
-    problem: Problem,
-    motions: Motions,
-    labelling: Labelling,
-    state: int,
-    index: Tensor,
-    light: TurnedLight | None = None,
+    problem: Problem, motions: Motions, labelling: Labelling, state: int, rows: Tensor, light: TurnedLight | None = None
 ) -> Tensor:
-    """``Met.cost`` [M] of the labelled surfels ``index`` [M] of ``state``; arguments as of ``meetings``."""
-    return meetings(problem, motions, labelling, state, index, light).cost()
+    """``Met.cost`` [M] of the labelled surfels ``rows`` [M] of ``state``; arguments as of ``meetings``."""
+    return meetings(problem, motions, labelling, state, rows, light).cost()
 
 
 def meetings(
-    problem: Problem,
-    motions: Motions,
-    labelling: Labelling,
-    state: int,
-    index: Tensor,
-    light: TurnedLight | None = None,
+    problem: Problem, motions: Motions, labelling: Labelling, state: int, rows: Tensor, light: TurnedLight | None = None
 ) -> Met:
-    """What the labelled surfels ``index`` [M] of ``state`` meet in the other state. light: of ``light_of``, if it is
+    """What the labelled surfels ``rows`` [M] of ``state`` meet in the other state. light: of ``light_of``, if it is
     known."""
     light = light_of(problem, motions, labelling) if light is None else light
     surf, stack, other = problem.surfels[state], problem.stacks[1 - state], problem.surfels[1 - state]
-    labels = labelling.labels(state)[index]
-    places = motions.places(surf.points[index], state == 1)
-    x, colours = places[labels, torch.arange(len(index))], surf.colours[index].clone()
-    n, thick = surf.normals[index].clone(), torch.zeros(len(index))
+    labels = labelling.labels(state)[rows]
+    places = motions.places(surf.points[rows], state == 1)
+    x, colours = places[labels, torch.arange(len(rows))], surf.colours[rows].clone()
+    n, thick = surf.normals[rows].clone(), torch.zeros(len(rows))
     for k in range(len(motions)):
         mine, motion = labels == k + 1, motions[k : k + 1]
         n[mine], thick[mine] = motion.rotate(n[mine], inverse=state == 1)[0], motion.thick
-    gains = light.gains(labels, n if state else surf.normals[index])
+    gains = light.gains(labels, n if state else surf.normals[rows])
     colours *= (1 / gains if state else gains)[:, None]
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(VIEWS))
     d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
@@ -104,7 +94,7 @@ def meetings(
         own=own.any(1),
         like=(other_side | (own & coloured)).any(1),
         other_side=other_side.any(1),
-        lost=(labels == 0) & problem.moved[state][index],
+        lost=(labels == 0) & problem.moved[state][rows],
     )
 
 
