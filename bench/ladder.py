@@ -71,16 +71,16 @@ def ties_of(name: str, zoo: Path) -> dict[str, list[float]]:
     return {joint: [float(x) for x in other.split(",")] for scene, joint, _, other in lines if scene == name}
 
 
-def is_right(gt, pred, others: list[float]) -> bool:
-    """Within ``RIGHT`` of the true joint, or of one with another turn that no picture tells from it."""
+def is_right(gt, pred, others: list[float], within: dict[str, float] = RIGHT) -> bool:
+    """Within bounds of the true joint, or of one with another turn that no picture tells from it."""
     if gt.type != pred.type:
         return False
     for motion in [gt.motion, *others]:
         e = joint_errors(pred, SimpleNamespace(type=gt.type, axis=gt.axis, origin=gt.origin, motion=motion))
-        bound = RIGHT["turn"] if gt.type == "revolute" else RIGHT["slide"]
+        bound = within["turn"] if gt.type == "revolute" else within["slide"]
         if (
-            e.axis_angle <= RIGHT["axis_angle"]
-            and (e.axis_position or 0) <= RIGHT["axis_position"]
+            e.axis_angle <= within["axis_angle"]
+            and (e.axis_position or 0) <= within["axis_position"]
             and e.motion <= bound
         ):
             return True
@@ -132,16 +132,15 @@ class Case:
     def similarity(self):
         return self.scene.similarity
 
-    def score(self, transforms: torch.Tensor, types: list[str]) -> dict:
-        """Each true joint's errors and whether it is right; how many parts are too many."""
+    def score(self, transforms: torch.Tensor, types: list[str], within: dict[str, float] = RIGHT) -> dict:
+        """Each true joint's errors and whether it is right, by the bounds ``within``; how many parts are too many."""
         found = [
             joint_of(to_input(T.double(), self.similarity), kind) for T, kind in zip(transforms, types, strict=True)
         ]
         truth = self.truth.joints
         others = [self.ties.get(name, []) for name in self.joints] or [[] for _ in truth]
-        right = np.array([[is_right(gt, p, o) for p in found] for gt, o in zip(truth, others, strict=True)]).reshape(
-            len(truth), len(found)
-        )
+        right = [[is_right(gt, p, o, within) for p in found] for gt, o in zip(truth, others, strict=True)]
+        right = np.array(right).reshape(len(truth), len(found))
         metric = JointError()
         metric.update(found, truth, paired(found, truth, right))
         report = metric.report
@@ -191,31 +190,40 @@ def runs_parser(about: str) -> argparse.ArgumentParser:
     return parser
 
 
-def write_rows(args: argparse.Namespace, row_of: Callable[[Case], dict]) -> None:
-    """A line of JSON per run, printed and, where asked for, written."""
-    torch.set_num_threads(args.threads)
-    for run in args.runs:
-        line = json.dumps(row_of(Case(run, args.zoo)))
-        print(line, flush=True)
-        if args.out:
-            with args.out.open("a") as f:
-                f.write(line + "\n")
+def of_found(motions: list) -> tuple[torch.Tensor, list[str]]:
+    """Transforms [K, 4, 4] and types of an explanation's motions."""
+    return torch.stack([torch.as_tensor(m.transform).double() for m in motions]), [m.type for m in motions]
 
 
-def main() -> None:
-    parser = runs_parser(__doc__.splitlines()[0])
-    args = parser.parse_args()
+def write_rows(
+    args: argparse.Namespace, row_of: Callable[[Case], dict], told: Callable[[dict], str] = json.dumps
+) -> None:
+    """A line of JSON per run, printed as ``told`` says and, where asked for, written."""
     torch.set_num_threads(args.threads)
     for run in args.runs:
-        case = Case(run, args.zoo)
-        motions, seconds = case.discover()
-        row = {"name": case.name, "seconds": round(seconds, 1), **case.score(motions.transforms, motions.types)}
-        row["found"] = [[t, round(float(c), 3)] for t, c in zip(motions.types, motions.confidence, strict=True)]
-        told = f"{row['name']}: {row['right']} of {row['of']} right, {row['extra']} too many, {row['seconds']} s"
-        print(told, row["joints"], row["found"], flush=True)
+        row = row_of(Case(run, args.zoo))
+        print(told(row), flush=True)
         if args.out:
             with args.out.open("a") as f:
                 f.write(json.dumps(row) + "\n")
+
+
+def rungs(case: Case) -> dict:
+    """A run's line."""
+    motions, seconds = case.discover()
+    row = {"name": case.name, "seconds": round(seconds, 1), **case.score(motions.transforms, motions.types)}
+    row["found"] = [[t, round(float(c), 3)] for t, c in zip(motions.types, motions.confidence, strict=True)]
+    return row
+
+
+def in_words(row: dict) -> str:
+    """The line as it is printed."""
+    told = f"{row['name']}: {row['right']} of {row['of']} right, {row['extra']} too many, {row['seconds']} s"
+    return f"{told} {row['joints']} {row['found']}"
+
+
+def main() -> None:
+    write_rows(runs_parser(__doc__.splitlines()[0]).parse_args(), rungs, in_words)
 
 
 if __name__ == "__main__":

@@ -13,65 +13,66 @@ in another colour ("colour"), the plate's other side that all views hide ("side"
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Iterator
 
 import torch
 from gates import true_motions
-from ladder import Case, runs_parser, write_rows
+from ladder import Case, of_found, runs_parser, write_rows
 
 from p2gs.motion.discovery import as_motions, discover
 from p2gs.motion.discovery.explanations import total_score
 from p2gs.motion.discovery.finish import Explanation, settle_parts
 from p2gs.motion.discovery.hypotheses import static_axes
-from p2gs.motion.discovery.labels import label
+from p2gs.motion.discovery.labels import Labelling, label
 from p2gs.motion.discovery.proposals import sided, stacked
 from p2gs.motion.discovery.rigid import Motions, without
 from p2gs.motion.discovery.verify import light_of, meetings, violation
 
 TRIED = 6  # motions tried in a part's place, and of all tries those that are fitted
 PROPOSED = 48, 8  # motions looked at and kept for what a set of motions leaves over
-THERE = SimpleNamespace(axis=5.0, position=0.5, turn=5.0, slide=0.05)  # bounds of a part that is there
+THERE = {"axis_angle": 5.0, "axis_position": 0.5, "turn": 5.0, "slide": 0.05}  # bounds of a part that is there
 
 
 class Rivals:
     """The search for explanations of lower energy, amid what ``discover`` found."""
 
     def __init__(self, found, limit: int):
-        self.found, self.problem, self.graphs, self.search = found, found.problem, found.graphs, found.search
-        self.limit, self.axes = limit, static_axes(found.problem)
+        self.problem, self.graphs, self.search, self.limit = found.problem, found.graphs, found.search, limit
+        self.axes = static_axes(found.problem)
+
+    def scored(self, motions: Motions, labelling: Labelling) -> Explanation:
+        """With its energy."""
+        return Explanation(motions, labelling, total_score(self.problem, motions, labelling))
 
     def explained(self, motions: Motions) -> Explanation:
         """The motions with their best labels and energy."""
-        labelling = label(self.problem, motions, self.graphs)
-        return Explanation(motions, labelling, total_score(self.problem, motions, labelling))
+        return self.scored(motions, label(self.problem, motions, self.graphs))
 
     def fitted(self, one: Explanation) -> Explanation:
         """The same, each motion fitted to its points, where that lowers the energy."""
-        motions, labelling = settle_parts(self.problem, self.graphs, one.motions, self.axes)
-        after = Explanation(motions, labelling, total_score(self.problem, motions, labelling))
+        after = self.scored(*settle_parts(self.problem, self.graphs, one.motions, self.axes))
         return min(one, after, key=lambda e: e.score)
 
-    def moves(self, one: Explanation) -> Iterator[Motions]:
+    def moves(self, one: Explanation) -> Iterator[Explanation]:
         """One part more, less, and another in its place."""
         yield from self.promising(one)
         for k in range(len(one.motions)):
             rest = self.explained(without(one.motions, k))
             if len(rest.motions):
-                yield rest.motions
+                yield rest
             yield from self.promising(rest)
 
-    def promising(self, rest: Explanation) -> Iterator[Motions]:
-        """``rest`` with one motion more, of those by which most of what it leaves wrong would be right: of the pool, to
-        which the search's proposals for what it leaves over are added."""
+    def promising(self, rest: Explanation) -> Iterator[Explanation]:
+        """``rest`` with one motion more, up to the limit, of those by which most of what it leaves wrong would be
+        right: of the pool, to which the search's proposals for what it leaves over are added."""
+        if len(rest.motions) >= self.limit:
+            return
         p, pool, left = self.problem, self.search.pool, self.left_wrong(rest)
         pool.add(self.search.propose(pool.add(rest.motions).tolist(), *PROPOSED)[0])
-        saved = []
-        for i in range(0, len(pool.motions), 64):
-            costs = [p.cost(pool.motions[i : i + 64], s, p.samples[s])[0] for s in (0, 1)]
-            saved.append(pool.mean([(x - c).clamp_min(0) for x, c in zip(left, costs, strict=True)]))
-        for k in torch.cat(saved).topk(min(TRIED, len(pool.motions))).indices:
-            yield Motions.cat([rest.motions, pool.motions[k[None]]])
+        costs = [p.cost(pool.motions, s, p.samples[s])[0] for s in (0, 1)]
+        saved = pool.mean([(x - c).clamp_min(0) for x, c in zip(left, costs, strict=True)])
+        for k in saved.topk(min(TRIED, len(pool.motions))).indices:
+            yield self.explained(Motions.cat([rest.motions, pool.motions[k[None]]]))
 
     def left_wrong(self, rest: Explanation) -> list[torch.Tensor]:
         """Violation [P] of each state's samples."""
@@ -84,8 +85,7 @@ class Rivals:
     def lowest(self, one: Explanation) -> Explanation:
         """Where moves lead to while the energy falls."""
         while len(one.motions):
-            tried = [self.explained(m) for m in self.moves(one) if len(m) <= self.limit]
-            best = [self.fitted(e) for e in sorted(tried, key=lambda e: e.score)[:TRIED]]
+            best = [self.fitted(e) for e in sorted(self.moves(one), key=lambda e: e.score)[:TRIED]]
             least = min(best, key=lambda e: e.score, default=one)
             if least.score >= one.score:
                 break
@@ -110,21 +110,6 @@ class Rivals:
         return {n: round(float(x) / max(mass, 1e-9), 3) for n, x in zip(names, total, strict=True)}
 
 
-def there(case: Case, motions: Motions) -> int:
-    """How many true parts some motion explains to within ``THERE``."""
-    if not len(motions):
-        return 0
-    count = 0
-    for joint in case.score(*stacked(motions))["joints"]:
-        if joint["right"]:
-            count += 1
-        elif joint["errors"] is not None:
-            axis, position, motion = joint["errors"]
-            most = THERE.turn if joint["type"] == "revolute" else THERE.slide
-            count += axis <= THERE.axis and (position or 0) <= THERE.position and motion <= most
-    return count
-
-
 def rivals(case: Case) -> dict:
     """A run's line."""
     config = case.cfg.phases["discovery"].config
@@ -134,12 +119,12 @@ def rivals(case: Case) -> dict:
         return row
     rival = Rivals(found, config.search.max_parts - 1)
     truth = rival.fitted(rival.explained(sided(found.problem, as_motions(*true_motions(case)))))
-    starts = [c.motions for c in found.candidates if c.motions]
-    starts = [(torch.stack([torch.as_tensor(m.transform).double() for m in of]), [m.type for m in of]) for of in starts]
-    ends = [rival.lowest(rival.explained(sided(found.problem, as_motions(*of)))) for of in starts]
+    starts = [as_motions(*of_found(c.motions)) for c in found.candidates if c.motions]
+    ends = [rival.lowest(rival.explained(sided(found.problem, start))) for start in starts]
     best = min(ends, key=lambda e: e.score, default=truth)
     for name, one in (("truth", truth), ("from the truth", rival.lowest(truth)), ("found", best)):
-        row[name] = {"energy": round(one.score, 4), "parts": len(one.motions), "there": there(case, one.motions)}
+        there = case.score(*stacked(one.motions), THERE)["right"]
+        row[name] = {"energy": round(one.score, 4), "parts": len(one.motions), "there": there}
         row[name]["meets"] = rival.shares(one)
     return row
 

@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import torch
 from gates import true_motions
-from ladder import Case, runs_parser, write_rows
+from ladder import Case, of_found, runs_parser, write_rows
 
 from p2gs.motion.discovery import as_motions, discover, surface_energy
 from p2gs.motion.discovery.rigid import Motions
-
-FIRST = 96, 16  # motions looked at and kept, as ``Search.fill`` has it
+from p2gs.motion.discovery.search import FIRST
 
 
 def nearest(truth: Motions, probe: torch.Tensor, motions: Motions) -> float | None:
@@ -33,7 +32,7 @@ def steps(case: Case) -> dict:
     config = case.cfg.phases["discovery"].config
     found = discover(*case.evidence(), case.cfg.num_parts, config.search, case.cfg.seed)
     transforms, types = true_motions(case)
-    explained = [round(surface_energy(found, *_of(c.motions)), 4) for c in found.candidates if c.motions]
+    explained = [round(surface_energy(found, *of_found(c.motions)), 4) for c in found.candidates if c.motions]
     row: dict = {"name": case.name, "energy": [round(surface_energy(found, transforms, types), 4), explained]}
     search = found.search
     if search is None:  # nothing moved
@@ -49,11 +48,6 @@ def steps(case: Case) -> dict:
         asked = {"swept": search.swept.motions, "last": last, "first": first, "pool": pool}
         row["joints"].append({"type": kind} | {name: nearest(one, search.probe, m) for name, m in asked.items()})
     return row
-
-
-def _of(motions: list) -> tuple[torch.Tensor, list[str]]:
-    """Transforms [K, 4, 4] and types of found motions."""
-    return torch.stack([torch.as_tensor(m.transform).double() for m in motions]), [m.type for m in motions]
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ from p2gs.motion.discovery.refine import gauss_newton, pattern_search
 from p2gs.motion.discovery.rigid import Motions
 
 THICKNESSES = 8  # of plates that are tried
+FIRST = 96, 16  # motions looked at and kept in each round that fills the pool
 
 
 def two_sided(problem: Problem, motions: Motions, gain: Callable[[Motions], Tensor]) -> Motions:
@@ -131,7 +132,7 @@ class Search:
         chosen: list[int] = []
         idle, last = 0, 0.0
         for _ in range(rounds):
-            motions, _ = self.propose(chosen, 96, 16)
+            motions, _ = self.propose(chosen, *FIRST)
             if len(motions) == 0:
                 break
             index = self.pool.add(motions)
