@@ -16,8 +16,8 @@ class NamedAdam(torch.optim.Adam):
 
     params: dicts {"params": [...], "name": str, "lr": float, ...}; names are unique.  The state is torch's (``step``,
     ``exp_avg``, ``exp_avg_sq``), so that checkpoints and the surgery of densification see nothing unusual. float32
-    parameters on the CPU take the native kernel, anything else torch's step. eps defaults to 3DGS's 1e-15: gradients of
-    Gaussians are small. Raises ValueError when a group has no name or a name comes twice.
+    parameters on the CPU take the native kernel, on a GPU torch's fused step, anything else torch's own. eps defaults
+    to 3DGS's 1e-15: gradients of Gaussians are small. Raises ValueError when a group has no name or a name comes twice.
     """
 
     def __init__(
@@ -31,7 +31,8 @@ class NamedAdam(torch.optim.Adam):
         names = [group.get("name") for group in params]
         if None in names or len(set(names)) != len(names):
             raise ValueError(f"every parameter group needs a name of its own, got {names}")
-        super().__init__(params, lr=lr, betas=betas, eps=eps)
+        on_cuda = all(p.is_cuda and p.dtype == torch.float32 for group in params for p in group["params"])
+        super().__init__(params, lr=lr, betas=betas, eps=eps, fused=on_cuda or None)
 
     def group(self, name: str) -> dict[str, Any]:
         """The parameter group of that name. Raises KeyError."""

@@ -209,8 +209,10 @@ class ArticulationPhase(ImagePhase):
         """Observed centres anew: nearest solid Gaussian of each single-state reconstruction to where the twin stands
         now."""
         labels = probs.argmax(1)
-        found, near = [], torch.ones(len(g), dtype=torch.bool)
+        device = g.means.device
+        found, near = [], torch.ones(len(g), dtype=torch.bool, device=device)
         for state, points in enumerate(self.states):
+            points = points.to(device)
             at = carry(g.detach(), labels, self.screws.at(state - self.times)).means
             distance, index = knn(points, at, 1, False)
             found.append(points[index[:, 0]])
@@ -225,7 +227,7 @@ class ArticulationPhase(ImagePhase):
         at = carry(g, labels, self.screws.at(0.0 - self.times)).means
         static, movable = at[labels == 0], at[labels > 0]
         r = self.config.repel
-        self.repel_points = torch.zeros(0, 3)
+        self.repel_points = at.new_zeros(0, 3)
         noise = r.noise * self.extent if step == 0 else 0.0
         if r.count > 0 and min(len(static), len(movable)) > 0:
             self.repel_points = place_repel_points(

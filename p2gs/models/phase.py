@@ -18,6 +18,7 @@ from p2gs.models.adam import NamedAdam
 from p2gs.models.health import check_gaussians, check_loss
 from p2gs.models.stage import PHASES, Stage, register_phase
 from p2gs.native import serial_torch
+from p2gs.ops.recorded import Recorder, recording
 from p2gs.render import draws_natively
 from p2gs.stopping import leave_if_asked
 from p2gs.types import UserError
@@ -58,6 +59,7 @@ class Phase(LightningModule, Stage):
         self.views: dict[int, TrainingViews] = {}
         self.scalars: dict[str, Tensor | float] = {}
         self.loss_cache: dict = {}
+        self.recorder = Recorder()
         self.track_gradients = False  # set by the densification callback
 
     # -- what a subclass gives ----------------------------------------------------------------------------------------
@@ -138,7 +140,7 @@ class Phase(LightningModule, Stage):
 
     def training_step(self, batch: Visit, batch_idx):
         assert batch.step == self.step, f"the loader is at step {batch.step}, {self.phase_name} at {self.step}"
-        with serial_torch(draws_natively(self.splats.means, self.rasterizer)):
+        with serial_torch(draws_natively(self.splats.means, self.rasterizer)), recording(self.recorder):
             self.one_step(batch)
 
     def one_step(self, visit: Visit) -> None:

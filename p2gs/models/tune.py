@@ -21,6 +21,7 @@ from p2gs.models.single_state import SplatRates
 from p2gs.native import serial_torch
 from p2gs.ops import se3
 from p2gs.ops.carry import Parts, RigidMoves
+from p2gs.ops.recorded import Recorder, recording
 from p2gs.render import draws_natively
 from p2gs.types import GaussianTensors
 
@@ -114,7 +115,7 @@ def tune(
         total: Any = sum(values)
         steps.take(total)
 
-    with serial_torch(draws_natively(splats.means, backend)):
+    with serial_torch(draws_natively(splats.means, backend)), recording(Recorder()):
         for step in range(config.steps):
             one_step(step)
     return splats.tensors().detach().to("cpu").clone()

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from p2gs.native import native, num_threads
+from p2gs.ops.recorded import recorded
 
 
 def _fast(*tensors: Tensor) -> bool:
@@ -39,6 +40,11 @@ def depth_spread(alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor,
     _same_shape("depth_spread", alpha, depth, depth_sq, target)
     if _fast(alpha, depth, depth_sq, target):
         return _DepthSpread.apply(alpha, depth, depth_sq, target.detach(), float(ref))
+    return recorded(_depth_spread, alpha, depth, depth_sq, target.detach(), float(ref))
+
+
+def _depth_spread(alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float) -> Tensor:
+    """``depth_spread`` written for reading: any floating dtype and device."""
     inside = (target > 0.5).to(alpha.dtype)
     first = depth - ref * alpha
     return ((alpha * depth_sq - first * first) * inside).sum() / inside.sum().clamp_min(1)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from p2gs.native import native, num_threads
+from p2gs.ops.recorded import recorded
 
 COVERED, SOLID = 0.9, 0.5  # a pixel is inside where the photograph's alpha and the rendered one are above these
 BREAK = 30.0  # contrasts that a step over the outline counts: nothing is left of the weight
@@ -31,7 +32,7 @@ def hidden_bends(
     nothing where it leaves the inside. Weights count as one in all at least, and the factor d^2 has no gradient. A
     scalar in the unit of depth, differentiable by depth and alpha, or None where no stride fits into the image. float32
     on the CPU takes the native kernel (the same bits for any number of threads), anything else
-    ``hidden_bends_reference``.  Raises ValueError for shapes that do not fit.
+    ``hidden_bends_reference`` (``recorded``).  Raises ValueError for shapes that do not fit.
     """
     size = alpha.shape
     if alpha.ndim != 2 or depth.shape != size or target_alpha.shape != size or image.shape != (*size, 3):
@@ -50,7 +51,7 @@ def hidden_bends(
         or target_alpha.requires_grad
         or any(t.dtype != torch.float32 or t.is_cuda for t in inputs)
     ):
-        return hidden_bends_reference(*inputs, strides, contrast, noise)
+        return recorded(hidden_bends_reference, *inputs, constants=(tuple(strides), contrast, noise))
     return _HiddenBends.apply(*inputs, strides, float(contrast), float(noise))
 
 

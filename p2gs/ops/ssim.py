@@ -6,6 +6,7 @@ images in [0, 1], zero padding, mean over pixels and channels. D-SSIM is 1 - SSI
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Hashable, MutableMapping, NamedTuple, Optional
 
 import torch
@@ -13,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from p2gs.native import native, num_threads
+from p2gs.ops.recorded import recorded
 
 Box = tuple[int, int, int, int]
 
@@ -50,7 +52,8 @@ def l1_ssim(
     under ("l1_ssim", key). They are used again only for the same tensor in the same memory and unchanged, so a target
     that is composed anew each step is merely not cached.
 
-    float32 CPU images take the native kernel (value and gradient in one pass), all others ``l1_ssim_reference``.
+    float32 CPU images take the native kernel (value and gradient in one pass), all others ``l1_ssim_reference``
+    (``recorded``).
     Raises ValueError when the shapes do not fit.
     """
     if pred.shape != target.shape or pred.ndim != 3 or pred.shape[-1] != 3:
@@ -63,7 +66,7 @@ def l1_ssim(
         key = None if key is None else (key, mask_box)
     fast = native is not None and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (pred, target))
     if not fast or target.requires_grad or pred.numel() == 0:
-        return l1_ssim_reference(pred, target, ssim_lambda)
+        return recorded(l1_ssim_reference, pred, target, constants=(float(ssim_lambda),))
     return _L1SSIM.apply(pred, target, float(ssim_lambda), cache, key)
 
 
@@ -120,8 +123,9 @@ def _statistics(cache, key, target: Tensor) -> tuple[bool, Tensor]:
     return False, planes
 
 
+@lru_cache(maxsize=None)
 def gaussian_window(dtype=torch.float32, device=None) -> Tensor:
-    """The weights of the separable window, [11], sigma 1.5, sum 1."""
+    """The weights of the separable window, [11], sigma 1.5, sum 1. One tensor for all callers: not to be written to."""
     x = torch.arange(11, dtype=torch.float64) - 5
     g = torch.exp(-(x**2) / (2 * 1.5**2))
     return (g / g.sum()).to(dtype=dtype, device=device)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import torch
 from worlds import OUTPUTS, backward, relative_error, world
 
+from p2gs.ops.sh import evaluate
 from p2gs.render import base
 
 
@@ -69,11 +70,17 @@ def _rasterization(
     )
 
 
+def _spherical_harmonics(degrees_to_use, dirs, coeffs):
+    """gsplat.spherical_harmonics: without the constant half, of directions of any length."""
+    assert coeffs.shape[-2] >= (degrees_to_use + 1) ** 2
+    return evaluate(coeffs, torch.nn.functional.normalize(dirs, dim=-1), degrees_to_use) - 0.5
+
+
 @contextmanager
 def stand_in_backend(monkeypatch):
     """Within it gsplat is the stand-in; gives the name of the backend that goes through it."""
     stand_in = types.ModuleType("gsplat")
-    stand_in.rasterization = _rasterization
+    stand_in.rasterization, stand_in.spherical_harmonics = _rasterization, _spherical_harmonics
     monkeypatch.setitem(sys.modules, "gsplat", stand_in)
     monkeypatch.setattr(base.RASTERIZERS, "_items", dict(base.RASTERIZERS._items))
     monkeypatch.delitem(sys.modules, "p2gs.render.gsplat", raising=False)
