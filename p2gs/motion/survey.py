@@ -17,26 +17,25 @@ from p2gs.ops import se3
 def survey(
     judge: Judge, motions: PartMotions, reach: list[float], candidates: int | None = None
 ) -> tuple[PartMotions, list[int]]:
-    """Lay each part, shifted within its own surface, where the energy is lowest by the smallest photographs
-    (``Judge.gain``); a refinement goes on from there.
+    """Each part shifted within its own surface, for a refinement to go on from.
 
     reach: shifts tried to both sides of the part's two long directions (internal units).  candidates: of a part's
     shifts, how many that the surfaces like best are looked at (None: all), with labels chosen anew: those that suit a
-    wrong place hold the part there.  Without surfaces (``judge.found``) labels stay, and all shifts are looked at.
-    Returns the motions and which of them moved.
+    wrong place hold the part there; it is laid where the energy is lowest by the smallest photographs
+    (``Judge.gain``).  Without surfaces (``judge.found``) labels stay, and each part is laid at the shift that the
+    smallest photographs like best, even if they like its present place better: a thin part's true place is told by
+    large ones alone.  Returns the motions and which of them moved.
     """
     glance, moved = judge.at_a_glance(judge.config.steps), []
     for k in range(len(motions)):
         laid, tries = motions, list(_shifted(judge, motions, k, reach))
         if judge.found is None:
-            # by its own pixels first: that is one look instead of three
-            tries = [tried for tried in tries if glance.cost(tried) < glance.cost(motions)]
+            laid = min(tries, key=glance.cost, default=motions)
         else:
             best = sorted(tries, key=judge.surfaces)[:candidates]
-            tries = [relabelled(judge.found, judge.states, tried) for tried in best]
-        for tried in tries:
-            if glance.gain(tried, laid) > 0:
-                laid = tried
+            for tried in (relabelled(judge.found, judge.states, tried) for tried in best):
+                if glance.gain(tried, laid) > 0:
+                    laid = tried
         if laid is not motions:
             motions = laid
             moved.append(k)
@@ -66,8 +65,9 @@ def _shifted(judge: Judge, motions: PartMotions, k: int, reach: list[float]) -> 
 def leave_false_minima(
     judge: Judge, motions: PartMotions, reach: list[float], candidates: int | None = None
 ) -> tuple[PartMotions, list[int]]:
-    """Refined motions once more from where ``survey`` lays the parts, as long as that gains, and no oftener than there
-    are parts and shifts: gains of several steps do not add up, so they might lead round in a circle.
+    """Refined motions once more from where ``survey`` lays the parts, each of which goes back where that gains, as long
+    as the whole gains, and no oftener than there are parts and shifts: gains of several steps do not add up, so they
+    might lead round in a circle.
 
     Returns them and which parts moved.
     """
@@ -76,8 +76,9 @@ def leave_false_minima(
         surveyed, moved = survey(judge, motions, reach, candidates)
         if not moved:
             break
-        surveyed = judge.improved(surveyed)[2]
+        surveyed = judge.no_worse(motions, judge.improved(surveyed)[2])
         if judge.gain(surveyed, motions) <= 0:
             break
+        moved = [k for k in moved if not torch.equal(surveyed.transforms[k], motions.transforms[k])]
         motions, gone = surveyed, sorted({*gone, *moved})
     return motions, gone

@@ -15,7 +15,7 @@ from p2gs.data.generated.articulated import SyntheticPart, revolute
 from p2gs.data.generated.furniture import box
 from p2gs.motion.discovery.amounts import parted
 from p2gs.motion.discovery.config import DiscoveryConfig
-from p2gs.motion.discovery.explanations import extended, finish, ranked, total_score
+from p2gs.motion.discovery.explanations import HINGE, extended, finish, ranked, total_score, unlikely_hinges
 from p2gs.motion.discovery.fields import Landing
 from p2gs.motion.discovery.finish import Explanation
 from p2gs.motion.discovery.hypotheses import Sweep, static_axes, sweep
@@ -29,6 +29,7 @@ from p2gs.motion.discovery.rows import rows
 from p2gs.motion.discovery.search import Search
 from p2gs.motion.discovery.verify import image_score, light_of, violation
 from p2gs.motion.light import TurnedLight
+from p2gs.ops import se3
 from p2gs.visibility.depth_stack import DepthStack, classify
 from p2gs.visibility.surfels import Surfels, window_planes
 
@@ -191,6 +192,28 @@ def test_that_more_is_said_to_move_makes_an_explanation_no_better(stacked):
     everybody = [torch.cat([torch.zeros(len(p), 1), p[:, 1:], p[:, :1]], 1) for p in wrong.probability]
     few, many = (image_score(problem, motions, Labelling(p, wrong.cost)) for p in (nobody, everybody))
     assert few > 0.02 and many >= few - 1e-6
+
+
+def test_a_flap_turned_over_has_a_hinge_that_no_hinge_would_be():
+    plate = (box((0, -0.6, -0.6), (0.12, 0.6, 0.6), PLAIN),)
+    obj = shell(SyntheticPart("door", plate, revolute((0, 0, -1.0), (0.12, -0.6, 0), 0, 110)))
+    (start, end), _ = both(obj)
+    problem, _ = build_problem(start, end, DiscoveryConfig(surfels=4000), 0)
+    true = torch.from_numpy(obj.parts[1].pose(1.0) @ np.linalg.inv(obj.parts[1].pose(0.0)))
+    corners = torch.from_numpy(np.concatenate([q.corners for q in obj.parts[1].primitives]))
+    middle = (corners.amin(0) + corners.amax(0)) / 2
+    over = true @ se3.from_screw(torch.tensor([0.0, 0, 1]).double(), middle, torch.tensor(math.pi).double())
+    graphs = [Graph(s.points, s.normals, s.colours) for s in problem.surfels]
+    doubts, rest = [], []
+    for T in (true, over):
+        motions = as_motions(T[None], ["revolute"])
+        labelling = label(problem, motions, graphs)
+        doubts.append(unlikely_hinges(problem, motions, labelling))
+        rest.append(total_score(problem, motions, labelling) - HINGE * doubts[-1])
+    assert rest[1] < rest[0] + 0.01  # what surfaces meet does not tell them apart
+    assert doubts[0] < 0.1 and doubts[1] > 0.7
+    slides = as_motions(torch.eye(4).double()[None], ["prismatic"])
+    assert unlikely_hinges(problem, slides, label(problem, slides, graphs)) == 0
 
 
 def test_a_door_that_turned_out_of_the_light_is_no_contradiction(stacked):

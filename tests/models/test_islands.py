@@ -1,6 +1,7 @@
 """Pieces of a part that hang apart from it, and shifted parts that cover themselves."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -139,6 +140,35 @@ def test_survey_leaves_a_false_minimum(kind, truth):
     better, which = leave_false_minima(judge, motions, [0.06, 0.12])
     assert which == [0] and float((better.transforms[0, :3, 3] - truth[:3, 3]).norm()) < 0.02
     assert leave_false_minima(judge, motions, []) == (motions, [])
+
+
+def test_a_place_that_small_photographs_like_less_is_refined_all_the_same(monkeypatch):
+    """Of a thin part large photographs alone tell the true place; small ones have it beside."""
+    truth = slide()
+    states, labels, views = two_states(truth)
+    off = shifted(truth, labels, states[0].gaussians.means, 0.12)
+    motions = PartMotions(["prismatic"], off[None], torch.ones(1), [labels, labels], [torch.ones(len(labels))] * 2)
+    judge = Judge(None, states, views, SURVEYED, [None, None], 0, "auto")  # type: ignore[list-item]
+    looked = []
+
+    def blind(tried):  # likes where the part is best, and else what is near the truth
+        away = float((tried.transforms[0] - truth)[:3, 3].norm())
+        looked.append(away)
+        return 0.0 if tried is motions else 1.0 + away
+
+    monkeypatch.setattr(Judge, "at_a_glance", lambda self, steps: SimpleNamespace(cost=blind))
+    better, which = leave_false_minima(judge, motions, [0.06])
+    assert which == [0] and min(looked) > 0.02  # none of the tries is the place itself
+    assert float((better.transforms[0, :3, 3] - truth[:3, 3]).norm()) < 0.02
+
+
+def test_a_part_at_its_place_stays_there():
+    truth = hinge()
+    states, labels, views = two_states(truth)
+    motions = PartMotions(["revolute"], truth[None], torch.ones(1), [labels, labels], [torch.ones(len(labels))] * 2)
+    judge = Judge(None, states, views, SURVEYED, [None, None], 0, "auto")  # type: ignore[list-item]
+    kept, _ = leave_false_minima(judge, motions, [0.06, 0.12])
+    assert float((kept.transforms[0] - truth).abs().max()) < 0.01
 
 
 def test_survey_chooses_labels_anew_for_what_surfaces_like_best(monkeypatch):

@@ -9,10 +9,13 @@ from torch import Tensor
 from p2gs.motion.discovery.amounts import parted
 from p2gs.motion.discovery.finish import Explanation, settle_parts
 from p2gs.motion.discovery.labels import Graph, Labelling, label
+from p2gs.motion.discovery.pool import plausibility
 from p2gs.motion.discovery.problem import Problem
 from p2gs.motion.discovery.rigid import Motions, axes_used, without
 from p2gs.motion.discovery.search import Search
 from p2gs.motion.discovery.verify import image_score
+
+HINGE = 0.5  # cost of moved surface that turns about a line that no hinge would have; what is empty costs 1
 
 
 def finish(problem: Problem, graphs: list[Graph], motions: Motions, limit: int, axes: Tensor) -> Explanation:
@@ -117,13 +120,25 @@ def prune(
 
 
 def total_score(problem: Problem, motions: Motions, labelling: Labelling) -> float:
-    """Image-space violation and the price of the parts. Lower is better.
+    """Image-space violation, the price of the parts and what hinges cost that no hinge would be. Lower is better.
 
     A further slide along the very direction of another costs a third: of its three freedoms it takes one.
     """
     axes = axes_used(motions)
     price = problem.config.part_cost * (axes + (len(motions) - axes) / 3)
-    return image_score(problem, motions, labelling) + price
+    return image_score(problem, motions, labelling) + price + HINGE * unlikely_hinges(problem, motions, labelling)
+
+
+def unlikely_hinges(problem: Problem, motions: Motions, labelling: Labelling) -> float:
+    """Share of the moved surface that turns about lines that no hinge would have (``plausibility``). 0..1.
+
+    A plain flap turned over lands on itself as well as one that turned about its hinge, beside which it hardly moves.
+    """
+    if not bool(motions.turn.any()):
+        return 0.0
+    pays = [p for p, _ in problem.pay(motions)]
+    doubt = 1 - plausibility(problem, motions, pays, problem.samples, False)
+    return float((torch.tensor(masses(problem, labelling)) * torch.where(motions.turn, doubt, 0.0)).sum())
 
 
 def twins(problem: Problem, motions: Motions, labelling: Labelling) -> int | None:

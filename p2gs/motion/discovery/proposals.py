@@ -31,8 +31,8 @@ def relabel(found: Discovery, transforms: Tensor, types: list[str]) -> Candidate
 
 def surface_energy(found: Discovery, transforms: Tensor, types: list[str]) -> float:
     """What the surfaces say against motions [K, 4, 4], every surfel choosing anew: where they land in seen-free space
-    or on what has another colour, moved surface that nothing carries, a price on each part. Lower is better; 0 where
-    nothing moved."""
+    or on what has another colour, moved surface that nothing carries, hinges that no hinge would be, a price on each
+    part. Lower is better; 0 where nothing moved."""
     if found.search is None:
         return 0.0
     motions = sided(found.problem, as_motions(transforms, types))

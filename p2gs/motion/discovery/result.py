@@ -31,7 +31,7 @@ class FoundMotion:
 
 @dataclass
 class Candidate:
-    """A complete explanation. score: lower is better (image-space violation plus the price of parts).
+    """A complete explanation. score: lower is better (``explanations.total_score``).
 
     probability: per state [M, K + 1] over the state's surfels (column 0 static).
     """
