@@ -40,8 +40,8 @@ _open = _Open()
 
 
 @contextmanager
-def recording(recorder: Recorder | None) -> Iterator[None]:
-    """Within it, ``recorded`` functions that this thread calls are recorded and replayed; None: they are called."""
+def recording(recorder: Recorder) -> Iterator[None]:
+    """Within it, ``recorded`` functions that this thread calls on a GPU are recorded and replayed."""
     before, _open.recorder = _open.recorder, recorder
     try:
         yield

@@ -134,11 +134,12 @@ def unlikely_hinges(problem: Problem, motions: Motions, labelling: Labelling) ->
 
     A plain flap turned over lands on itself as well as one that turned about its hinge, beside which it hardly moves.
     """
-    if not bool(motions.turn.any()):
+    turns = motions[motions.turn]
+    if not len(turns):
         return 0.0
-    pays = [p for p, _ in problem.pay(motions)]
-    doubt = 1 - plausibility(problem, motions, pays, problem.samples, False)
-    return float((torch.tensor(masses(problem, labelling)) * torch.where(motions.turn, doubt, 0.0)).sum())
+    pays = [p for p, _ in problem.pay(turns)]
+    doubt = 1 - plausibility(problem, turns, pays, problem.samples, False)
+    return float((torch.tensor(masses(problem, labelling))[motions.turn] * doubt).sum())
 
 
 def twins(problem: Problem, motions: Motions, labelling: Labelling) -> int | None:
