@@ -22,8 +22,9 @@ from p2gs.gaussians.pose import carry, with_static
 from p2gs.gaussians.splats import Splats
 from p2gs.models.tune import TuneConfig, TwinSteps
 from p2gs.motion.light import TurnedLight, brighter, facing_either
+from p2gs.motion.motion_steps import MotionSteps
 from p2gs.motion.part_pull import part_pulls
-from p2gs.motion.screw_polish import MotionSteps, MovedGaussians, PolishConfig, Side, anchors_of, photometric_cost
+from p2gs.motion.screw_polish import MovedGaussians, PolishConfig, Side, anchors_of, photometric_cost
 from p2gs.native import at_once, serial_torch
 from p2gs.ops import se3
 from p2gs.ops.carry import RigidMoves

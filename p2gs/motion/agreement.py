@@ -27,6 +27,8 @@ from p2gs.visibility.free_space import landed
 EXTENT = 3.0  # standard deviations at which a Gaussian ends for the eye
 # what ``unmoved`` found last: Gaussians, tolerance, result
 _UNMOVED: WeakKeyDictionary[DepthStack, tuple] = WeakKeyDictionary()
+# what ``next_to`` found last of what stays: Gaussians, the other state's, result
+_NEAR: WeakKeyDictionary[DepthStack, tuple] = WeakKeyDictionary()
 NEIGHBOURS = 4  # of the other state's Gaussians, one of which must be like the one that lands there
 
 
@@ -57,7 +59,8 @@ def kept_and_shown(
     on[moving], through[moving] = met(stack, at[moving], config.free_moving)
     for end in ends(g[moving]):
         through[moving] |= met(stack, landed(end, labels[moving], T), config.free_static)[1]
-    like, part = alike(states, motions, state, at, dc_to_rgb(lit.sh[:, 0]).clamp(0, 1), config)
+    near = next_to(states[1 - state].gaussians, g, at, moving, stack)
+    like, part = alike(states, motions, state, at, near, dc_to_rgb(lit.sh[:, 0]).clamp(0, 1), config)
     own = (way[:, :3, :3] @ seen_from(g, stacks[state], config.free_static)[moving].to(way)[..., None])[..., 0]
     same_side = (own * stack.seen_from(at[moving], config.free_moving)).sum(1) > 0
     behind = torch.zeros_like(on)
@@ -93,18 +96,34 @@ def ends(g: GaussianTensors) -> list[Tensor]:
     return [g.means + sign * axes[..., a] for a in (0, 1) for sign in (1, -1)]
 
 
-def alike(
-    states: list[StateGaussians], motions: PartMotions, state: int, at: Tensor, colours: Tensor, config: PolishConfig
-) -> tuple[Tensor, Tensor]:
-    """[N] bool each, of the other state's solid Gaussians next to ``at`` [N, 3]: whether one came from where these are
-    (to within ``config.free_moving``) and is of like colour (``colours`` [N, 3] in 0..1, mean of channels); whether one
-    came from there at all."""
-    other = states[1 - state].gaussians
+def next_to(other: GaussianTensors, g: GaussianTensors, at: Tensor, moving: Tensor, stack: DepthStack) -> Tensor:
+    """[N, 4] the solid ones of ``other`` that are nearest to ``at`` [N, 3], where a motion carries ``g``, of which it
+    moves the rows ``moving``; [N, 0] where there are fewer. Those of what stays are found once for the other state's
+    ``stack``."""
     solid = other.solid.nonzero().squeeze(1)
     if len(solid) < NEIGHBOURS:
-        none = torch.zeros(len(at), dtype=torch.bool)
-        return none, none
-    near = solid[knn(other.means[solid].contiguous(), at.contiguous(), NEIGHBOURS)[1]]
+        return torch.zeros(len(at), 0, dtype=torch.int64)
+    tree, known = other.means[solid].contiguous(), _NEAR.get(stack)
+    if known is None or known[0] is not g or known[1] is not other:
+        known = _NEAR[stack] = (g, other, solid[knn(tree, g.means.contiguous(), NEIGHBOURS)[1]])
+    near = known[2].clone()
+    near[moving] = solid[knn(tree, at[moving].contiguous(), NEIGHBOURS)[1]]
+    return near
+
+
+def alike(
+    states: list[StateGaussians],
+    motions: PartMotions,
+    state: int,
+    at: Tensor,
+    near: Tensor,
+    colours: Tensor,
+    config: PolishConfig,
+) -> tuple[Tensor, Tensor]:
+    """[N] bool each, of the other state's Gaussians ``near`` [N, 4] to ``at`` [N, 3]: whether one came from where these
+    are (to within ``config.free_moving``) and is of like colour (``colours`` [N, 3] in 0..1, mean of channels); whether
+    one came from there at all."""
+    other = states[1 - state].gaussians
     theirs = dc_to_rgb(other.sh[:, 0]).clamp(0, 1)
     apart = (theirs[near] - colours[:, None]).abs().mean(-1)
     T = with_static(se3.inverse(motions.transforms) if state else motions.transforms).to(at)

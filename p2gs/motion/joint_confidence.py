@@ -14,7 +14,8 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import StateGaussians
-from p2gs.motion.screw_polish import MovedGaussians, apply_step
+from p2gs.motion.motion_steps import apply_step
+from p2gs.motion.screw_polish import MovedGaussians
 from p2gs.ops import se3
 from p2gs.types import Camera
 from p2gs.visibility.depth_stack import DepthStack, classify

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Callable
+from typing import Callable, TypeVar
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ from p2gs.visibility.depth_stack import DepthStack
 # weighted 0.8) as landing in hidden space costs of landing in free space.
 HIDDEN = 0.8 * Landing.HIDDEN
 KNOWN = 64  # answers of a ``Judge`` that are kept
+T = TypeVar("T")
 LOOKED = 4  # motions of which a ``Judge`` keeps what counts: pixels' weights of all views
 
 
@@ -36,14 +37,22 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
 
 
 def sides_of(
-    states, motions: PartMotions, views, config: PolishConfig, stacks: list[DepthStack], *, backend: str, device="cpu"
+    states,
+    motions: PartMotions,
+    views,
+    config: PolishConfig,
+    stacks: list[DepthStack],
+    *,
+    backend: str,
+    seen: list[Seen] | None = None,
+    device="cpu",
 ) -> list[Side]:
     """Both directions: the start's Gaussians against the end's photographs, and the reverse, of each what both states
     show.
 
-    stacks: rendered depth of both states.
+    stacks: rendered depth of both states.  seen: of ``what_counts`` for these motions (None: found).
     """
-    seen = what_counts(states, motions, config, stacks, backend=backend, device=device)
+    seen = what_counts(states, motions, config, stacks, backend=backend, device=device) if seen is None else seen
     sides = []
     for s in (0, 1):
         labels = torch.where(seen[s].kept, polish_labels(motions, s, config.min_margin), -1)
@@ -62,12 +71,14 @@ def refine(
     seed: int,
     backend: str,
     axes: Tensor | None = None,
+    seen: list[Seen] | None = None,
     device="cpu",
 ) -> PartMotions:
-    """Photometric refinement of all motions, both directions at once. axes: as in ``polish``."""
+    """Photometric refinement of all motions, both directions at once. axes: as in ``polish``.  seen: as in
+    ``sides_of``."""
     if config.steps <= 0 or len(motions) == 0:
         return motions
-    sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
+    sides = sides_of(states, motions, views, config, stacks, seen=seen, backend=backend, device=device)
     options = {"seed": seed, "axes": axes, "backend": backend, "device": device}
     result, _ = polish(sides, motions.transforms, motions.types, config, **options)
     return replace(motions, transforms=result)
@@ -130,6 +141,20 @@ def explanation_cost(
     return 0.5 * sum(at_once(one_way, (0, 1)))
 
 
+class Latest:
+    """The latest ``count`` answers. Several threads may ask at once, and may then work out the same."""
+
+    def __init__(self, count: int):
+        self.count, self.kept = count, []
+
+    def __call__(self, of: object, answer: Callable[[], T], also: object = None) -> T:
+        """``answer()``, or what it was the last time for this very object ``of`` and an equal ``also``."""
+        known = next((k for k in self.kept if k[0] is of and k[1] == also), None)
+        known = (of, also, answer()) if known is None else known
+        self.kept = [*[k for k in self.kept if k is not known][1 - self.count :], known]
+        return known[2]
+
+
 @dataclass
 class Judge:
     """By what explanations are compared and refined: one number, the logarithm of the image loss (``explanation_cost``)
@@ -150,40 +175,29 @@ class Judge:
     backend: str
     device: torch.device | str = "cpu"
     further: float = 0.0
-    # the latest motions, what was asked of them, the answer; and the latest with what counts under them
-    known: list[tuple] = field(default_factory=list, init=False)
-    looked: list[tuple] = field(default_factory=list, init=False)
-
-    def _asked(self, motions: PartMotions, what: str, answer: Callable[[], float]) -> float:
-        """``answer()``, or what it was the last time for the same motions."""
-        for m, name, value in self.known:
-            if m is motions and name == what:
-                return value
-        self.known = [*self.known[-KNOWN:], (motions, what, answer())]
-        return self.known[-1][2]
+    # the latest answers: image losses; what surfaces say of transforms and types; what counts
+    losses: Latest = field(default_factory=partial(Latest, KNOWN), init=False)
+    surfaced: Latest = field(default_factory=partial(Latest, KNOWN), init=False)
+    looked: Latest = field(default_factory=partial(Latest, LOOKED), init=False)
 
     def at_a_glance(self, steps: int) -> Judge:
         """The same by the smallest photographs, refining in fewer steps."""
-        return replace(
-            self, config=replace(self.config, steps=steps, levels=self.config.levels[:1], level_starts=[0.0])
-        )
+        small = replace(self.config, steps=steps, levels=self.config.levels[:1], level_starts=[0.0])
+        glance = replace(self, config=small)
+        glance.surfaced, glance.looked = self.surfaced, self.looked  # neither hangs on the photographs' size
+        return glance
 
     def seen(self, motions: PartMotions) -> list[Seen]:
         """What counts under these motions (``what_counts``)."""
-        seen = next((seen for m, seen in self.looked if m is motions), None)
-        if seen is None:
-            options = {"backend": self.backend, "device": self.device}
-            seen = what_counts(self.states, motions, self.config, self.stacks, **options)
-        others = [known for known in self.looked if known[0] is not motions]
-        self.looked = [*others[1 - LOOKED :], (motions, seen)]
-        return seen
+        options = {"backend": self.backend, "device": self.device}
+        return self.looked(motions, partial(what_counts, self.states, motions, self.config, self.stacks, **options))
 
     def cost(self, motions: PartMotions, by: PartMotions | None = None) -> float:
         """Image loss (``explanation_cost``) of what counts under the motions ``by`` (None: under these)."""
         by = motions if by is None else by
         options = {"seen": self.seen(motions), "by": self.seen(by), "backend": self.backend, "device": self.device}
         ask = partial(explanation_cost, self.states, motions, self.views, self.config, self.stacks, **options)
-        return ask() if by is not motions else self._asked(motions, "cost", ask)
+        return ask() if by is not motions else self.losses(motions, ask)
 
     def saved(self, tried: PartMotions, than: PartMotions) -> float:
         """Logarithm of how much smaller the image loss of ``tried`` is than that of ``than``, on the same pixels: those
@@ -232,7 +246,8 @@ class Judge:
         """What the surfaces say (``surface_energy``); nothing without ``found``."""
         if self.found is None:
             return 0.0
-        return self._asked(motions, "surfaces", partial(surface_energy, self.found, motions.transforms, motions.types))
+        ask = partial(surface_energy, self.found, motions.transforms, motions.types)
+        return self.surfaced(motions.transforms, ask, tuple(motions.types))
 
     def __call__(self, motions: PartMotions) -> tuple[float, float]:
         """Energy and image loss."""
@@ -241,8 +256,10 @@ class Judge:
 
     def refine(self, motions: PartMotions, axes: Tensor | None = None) -> PartMotions:
         """Refined by the photographs, whether or not the energy falls. axes: as in ``polish``."""
+        if self.config.steps <= 0 or len(motions) == 0:
+            return motions
         options = {"seed": self.seed, "axes": axes, "backend": self.backend, "device": self.device}
-        return refine(self.states, motions, self.views, self.config, self.stacks, **options)
+        return refine(self.states, motions, self.views, self.config, self.stacks, seen=self.seen(motions), **options)
 
     def improved(self, motions: PartMotions) -> tuple[float, float, PartMotions]:
         """Energy, image loss and motions: refined where that gains, else as they were. Where a part is plain,

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from p2gs.data.views import TrainingViews, view_index
 from p2gs.motion.light import FEWEST
+from p2gs.motion.motion_steps import MotionSteps
 from p2gs.motion.part_pull import by_inverse, part_pulls
 from p2gs.ops import se3, so3
 from p2gs.ops.carry import Parts, carry
-from p2gs.ops.decay import exponential
 from p2gs.ops.ssim import l1_ssim
 from p2gs.render import rasterize
 from p2gs.types import Camera, GaussianTensors
@@ -97,82 +97,6 @@ class MovedGaussians:
             features=features,
             backend=backend,
         )
-
-
-def along_axes(kinds: list[str], axes: Tensor, step: Tensor) -> Tensor:
-    """Tangent steps [K, 6] without what would tilt joints whose axes [K, 3] are held (NaN: free): of a turn the
-    rotation about its axis and the shift across it stay, of a slide the shift along it."""
-    held = ~axes.isnan().any(1, keepdim=True)
-    d = axes.nan_to_num()
-    rotation, shift = ((x * d).sum(1, keepdim=True) * d for x in (step[:, :3], step[:, 3:]))
-    slides = torch.tensor([kind == "prismatic" for kind in kinds])[:, None]
-    return torch.where(held, torch.cat([rotation, torch.where(slides, shift, step[:, 3:] - shift)], 1), step)
-
-
-def allowed_step(kinds: list[str], T: Tensor, centre: Tensor, radius: Tensor, step: Tensor) -> Tensor:
-    """Project tangent steps [K, 6] = (rotation * radius, translation) at ``centre`` [K, 3] onto the motions of the
-    joints' types.
-
-    T [K, 4, 4], radius [K].  Prismatic: no rotation. Revolute: the pitch (translation along the axis) must stay zero,
-    one linear condition; a Newton correction removes what pitch there is. Free: as it is.
-    """
-    rotvec = so3.matrix_to_rotvec(T[:, :3, :3])
-    angle = rotvec.norm(dim=1, keepdim=True).clamp_min(1e-3)
-    axis, t = rotvec / angle, T[:, :3, 3]
-    pitch = (axis * t).sum(1, keepdim=True)
-    across = t - axis * pitch
-    # the axis turns by the inverse left Jacobian of the rotation vector (Sola et al. 2018, arXiv:1812.01537, Eq. 146)
-    tilt = across / (2 * torch.tan(angle / 2)) + torch.linalg.cross(axis, across) / 2
-    normal = torch.cat([(torch.linalg.cross(t - centre, axis) + tilt) / radius[:, None], axis], 1)
-    turned = step - normal * (
-        ((normal * step).sum(1, keepdim=True) + pitch) / (normal * normal).sum(1, keepdim=True).clamp_min(1e-12)
-    )
-    slid = torch.cat([torch.zeros_like(step[:, :3]), step[:, 3:]], 1)
-    by_type = {"revolute": turned, "prismatic": slid, "free": step}
-    return torch.stack([by_type[kind][k] for k, kind in enumerate(kinds)]) if kinds else step
-
-
-def apply_step(T: Tensor, centre: Tensor, radius: Tensor | float, step: Tensor) -> Tensor:
-    """exp of the tangent step [..., 6] about ``centre`` [..., 3], after T [..., 4, 4]; radius [..., 1] or a number."""
-    R = so3.rotvec_to_matrix(step[..., :3] / radius)
-    return se3.make(R, centre - (R @ centre[..., None])[..., 0] + step[..., 3:]) @ T
-
-
-class MotionSteps:
-    """Adam (arXiv:1412.6980) on rigid part motions of given types.
-
-    types: "revolute" | "prismatic" | "free" per part.  radius [K]: spread of each part's points.  rate: step size at
-    the start in units of displacement at that radius; falls to a hundredth.  axes [K, 3]: directions that joints keep
-    (NaN: free; None: all are).
-    """
-
-    def __init__(self, types: list[str], radius: Tensor, rate: float, axes: Tensor | None = None):
-        self.types, self.radius, self.rate, self.axes = types, radius[:, None], rate, axes
-        self.slides = torch.tensor([kind == "prismatic" for kind in types])
-        self.first, self.second = torch.zeros(len(types), 6).double(), torch.zeros(len(types), 6).double()
-        self.taken = torch.zeros(len(types), 1)
-
-    def take(self, transforms: Tensor, gradient: Tensor, centre: Tensor, fraction: float, on: Tensor) -> Tensor:
-        """The motions [K, 4, 4] after a step. gradient [K, 6]: by rotation about ``centre`` [K, 3] and by translation.
-        fraction: how much of the descent is done.  on [K] bool: which parts have a say."""
-        gradient = torch.cat([gradient[:, :3] / self.radius, gradient[:, 3:]], 1)
-        on = on[:, None]
-        self.taken = self.taken + on
-        self.first = torch.where(on, 0.9 * self.first + 0.1 * gradient, self.first)
-        self.second = torch.where(on, 0.99 * self.second + 0.01 * gradient * gradient, self.second)
-        seen = self.taken.clamp_min(1)
-        direction = self.first / (1 - 0.9**seen) / ((self.second / (1 - 0.99**seen)).sqrt() + 1e-12)
-        rate = self.rate * exponential(1.0, 0.01, fraction)
-        delta = allowed_step(self.types, transforms, centre, self.radius[:, 0], -rate * direction)
-        delta = delta if self.axes is None else along_axes(self.types, self.axes, delta)
-        transforms = torch.where(on[..., None], apply_step(transforms, centre, self.radius, delta), transforms)
-        transforms[self.slides, :3, :3] = torch.eye(3, dtype=torch.float64)
-        return transforms
-
-    def ended(self, transforms: Tensor) -> Tensor:
-        """The motions without what pitch the last steps left to turns."""
-        of_type = zip(self.types, transforms, strict=True)
-        return torch.stack([se3.project_revolute(T) if kind == "revolute" else T for kind, T in of_type])
 
 
 @dataclass

@@ -3,14 +3,16 @@ place, a minimum of its own, centimetres from the true one, that no descent leav
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Iterator
 
 import torch
 
 from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.motion_steps import allowed_step, apply_step
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.relabel import relabelled
-from p2gs.motion.screw_polish import allowed_step, apply_step
+from p2gs.native import at_once
 from p2gs.ops import se3
 
 
@@ -32,8 +34,9 @@ def survey(
         if judge.found is None:
             laid = min(tries, key=glance.cost, default=motions)
         else:
-            best = sorted(tries, key=judge.surfaces)[:candidates]
-            for tried in (relabelled(judge.found, judge.states, tried) for tried in best):
+            asked = at_once(judge.surfaces, tries)
+            best = [tries[i] for i in sorted(range(len(tries)), key=asked.__getitem__)[:candidates]]
+            for tried in at_once(partial(relabelled, judge.found, judge.states), best):
                 if glance.gain(tried, laid) > 0:
                     laid = tried
         if laid is not motions:

@@ -89,4 +89,5 @@ NB_MODULE(_native, m) {
     bind_assign(m);
     bind_repel(m);
     bind_cut(m);
+    bind_steps(m);
 }

@@ -5,6 +5,8 @@ a degree."""
 from __future__ import annotations
 
 import math
+from functools import partial
+from operator import itemgetter
 
 import torch
 from torch import Tensor
@@ -23,6 +25,7 @@ from p2gs.motion.directions import (
 from p2gs.motion.discovery.rigid import one_way
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.relabel import relabelled
+from p2gs.native import at_once
 
 
 def lay_axes(
@@ -53,9 +56,8 @@ def lay_axes(
         shared = shared_axes(motions.transforms, motions.types)
         parts = [k] if bool(shared[k].isnan().any()) else one_way(shared, shared[k]).nonzero()[:, 0].tolist()
         alike = (directions @ directions[along.argmax()]).abs() > math.cos(math.radians(SQUARE))
-        gained, laid, axes = max(
-            (_best_laid(judge, motions, parts, _at(held, parts, d)) for d in directions[alike]), key=lambda t: t[0]
-        )
+        tried = [_at(held, parts, d) for d in directions[alike]]
+        gained, laid, axes = max(at_once(partial(_best_laid, judge, motions, parts), tried), key=itemgetter(0))
         saved = judge.own_share(laid, motions)
         off = math.degrees(math.acos(min(1.0, float(along.max()))))
         taken = gained >= -price and (off <= WITHIN or saved >= -further)
@@ -109,4 +111,4 @@ def _best_laid(judge: Judge, motions: PartMotions, parts: list[int], axes: Tenso
     tried = [laid, judge.refine(laid, axes)]
     if judge.found is not None:
         tried.append(judge.refine(relabelled(judge.found, judge.states, tried[1]), axes))
-    return *max(((judge.gain(m, motions), m) for m in tried), key=lambda t: t[0]), axes
+    return *max(((judge.gain(m, motions), m) for m in tried), key=itemgetter(0)), axes

@@ -10,12 +10,14 @@ Photographs, not the cut, decide.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Iterator
 
 import torch
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.refine_motions import Judge
+from p2gs.native import at_once
 from p2gs.parts.label_cut import spread, with_all_static
 from p2gs.parts.part_choices import without_part
 
@@ -27,8 +29,9 @@ def expand(judge: Judge, motions: PartMotions) -> tuple[PartMotions, list[dict]]
     taken: list[dict] = []
     while len(motions):
         best, told = None, {"energy": 0.0}
-        for how, part, tried in expansions(judge, motions):
-            gained = judge.gain(tried, motions)
+        tries = list(expansions(judge, motions))
+        gains = at_once(partial(judge.gain, than=motions), [tried for _, _, tried in tries])
+        for (how, part, tried), gained in zip(tries, gains, strict=True):
             if gained > -told["energy"] and (own := judge.own_share(tried, motions)) >= judge.further:
                 best, told = tried, {"change": how, "part": part, "own_share": own, "energy": -gained}
         if best is None:

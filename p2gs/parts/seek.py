@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from operator import itemgetter
 
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.discovery import left_over
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.relabel import relabelled
+from p2gs.native import at_once
 from p2gs.parts.options import PartMotionsConfig
 
 FEWEST = 20  # Gaussians of a part in each state
@@ -22,20 +24,20 @@ def seek(judge: Judge, motions: PartMotions, limit: int, config: PartMotionsConf
     if judge.found is None:
         return motions, log
     while 0 < len(motions) < limit:
-        looked = []
-        for T, kind in left_over(judge.found, motions.transforms, motions.types):
-            tried = relabelled(judge.found, judge.states, motions.with_motion(len(motions), kind, T))
-            if min(int((of == len(tried)).sum()) for of in tried.labels) >= FEWEST:
-                looked.append((judge.own_share(tried, motions), tried))
-        refined = []
-        for saved, tried in sorted(looked, key=itemgetter(0), reverse=True)[: config.candidates]:
-            if saved > 0:
-                after = judge.refine(tried)
-                refined.append((judge.own_share(after, motions), after))
-                told = {"type": tried.types[-1], "proposed": saved, "own_share": refined[-1][0]}
-                log.append({"change": "sought", **told})
-        saved, best = max(refined, key=itemgetter(0), default=(-math.inf, motions))
+        left = left_over(judge.found, motions.transforms, motions.types)
+        further = [motions.with_motion(len(motions), kind, T) for T, kind in left]
+        further = at_once(partial(relabelled, judge.found, judge.states), further)
+        further = [m for m in further if min(int((of == len(m)).sum()) for of in m.labels) >= FEWEST]
+        judge.seen(motions)  # once, and not in each thread
+        looked = zip(at_once(partial(judge.own_share, than=motions), further), further, strict=True)
+        best = sorted((one for one in looked if one[0] > 0), key=itemgetter(0), reverse=True)[: config.candidates]
+        refined = at_once(judge.refine, [tried for _, tried in best])
+        shares = at_once(partial(judge.own_share, than=motions), refined)
+        for (proposed, tried), reached in zip(best, shares, strict=True):
+            told = {"type": tried.types[-1], "proposed": proposed, "own_share": reached}
+            log.append({"change": "sought", **told})
+        saved, found = max(zip(shares, refined, strict=True), key=itemgetter(0), default=(-math.inf, motions))
         if saved < config.seek:
             break
-        motions = best
+        motions = found
     return motions, log

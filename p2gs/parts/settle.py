@@ -90,10 +90,8 @@ def _best_refined(
 
 def _with_part(found: Discovery, states, motions: PartMotions, part: int | None) -> list[PartMotions]:
     """The motions with another one for ``part`` (None: with one more), labels chosen anew."""
-    k, out = len(motions) if part is None else part, []
-    for transform, kind in instead_of(found, motions.transforms, motions.types, part):
-        out.append(relabelled(found, states, motions.with_motion(k, kind, transform)))
-    return out
+    k, proposed = len(motions) if part is None else part, instead_of(found, motions.transforms, motions.types, part)
+    return at_once(partial(relabelled, found, states), [motions.with_motion(k, kind, T) for T, kind in proposed])
 
 
 def _turned_over(found: Discovery, states, motions: PartMotions) -> list[tuple[int, PartMotions]]:
@@ -116,11 +114,9 @@ def _turned_over(found: Discovery, states, motions: PartMotions) -> list[tuple[i
 
 def _proposed(found: Discovery, states, motions: PartMotions, proposals: list[tuple]) -> list[tuple[int, PartMotions]]:
     """Of each (part, transforms, types) the part and the motions, labels chosen anew."""
-    out = []
-    for k, transforms, types in proposals:
-        tried = replace(motions, types=types, transforms=transforms, confidence=torch.zeros(len(types)))
-        out.append((k, relabelled(found, states, tried)))
-    return out
+    tried = [replace(motions, types=of, transforms=T, confidence=torch.zeros(len(of))) for _, T, of in proposals]
+    labelled = at_once(partial(relabelled, found, states), tried)
+    return [(k, m) for (k, _, _), m in zip(proposals, labelled, strict=True)]
 
 
 def settle_labels(judge: Judge, motions: PartMotions, config: PartMotionsConfig) -> tuple[PartMotions, list[dict]]:

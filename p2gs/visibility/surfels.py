@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
+from p2gs.ops.knn import search_tree
 from p2gs.ops.robust import MEDIAN_SIGMA
 from p2gs.visibility.depth_stack import DepthStack, StateEvidence
 
 
-@dataclass
+@dataclass(eq=False)
 class Surfels:
     """points [N, 3]; normals [N, 3] unit, towards the cameras; colours [N, 3]; spacing: median distance to the 4th
     neighbour; noise: robust standard deviation of the depth maps about the surfels, along the normal (scene units)."""
@@ -26,6 +28,18 @@ class Surfels:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """k-d tree of the points, built when it is first asked for."""
+        return search_tree(self.points.numpy())
+
+    def nearest(self, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """Distances [N, k] (float64) and indices [N, k] of the k surfels nearest to points [N, 3], nearest first; of
+        all where there are fewer."""
+        k = min(k, len(self))
+        d, j = self.tree.query(points.detach().cpu().float().numpy(), k=k)
+        return torch.from_numpy(np.reshape(d, (len(points), k))), torch.from_numpy(np.reshape(j, (len(points), k)))
 
     def __getitem__(self, index) -> "Surfels":
         return Surfels(self.points[index], self.normals[index], self.colours[index], self.spacing, self.noise)

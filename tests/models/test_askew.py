@@ -17,7 +17,8 @@ from p2gs.motion.directions import (
     squared,
     turned_onto,
 )
-from p2gs.motion.screw_polish import PolishConfig, allowed_step, along_axes, apply_step
+from p2gs.motion.motion_steps import allowed_step, along_axes, apply_step
+from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3, so3
 from p2gs.parts.askew import keep_axes, lay_axes, on_axes
 from p2gs.types import GaussianTensors

@@ -6,8 +6,9 @@ from tiny import hinge, photographs, slide, textured_panels
 
 from p2gs.data.views import TrainingViews
 from p2gs.gaussians.pose import carry, with_static
+from p2gs.motion.motion_steps import KINDS, MotionSteps, allowed_step, apply_step
 from p2gs.motion.part_pull import tangent_gradient
-from p2gs.motion.screw_polish import PolishConfig, Side, allowed_step, apply_step, polish
+from p2gs.motion.screw_polish import PolishConfig, Side, polish
 from p2gs.ops import se3, so3
 from p2gs.ops.ssim import l1_ssim
 
@@ -63,6 +64,29 @@ def test_the_forbidden_direction_is_the_derivative_of_the_pitch():
         step = torch.randn(6).double()
         lost = step - allowed("revolute", T, centre, radius, step)
         assert torch.allclose(lost, numeric * (numeric @ step) / (numeric @ numeric), atol=1e-5)
+
+
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.7, 3.1, torch.pi])
+def test_the_kernel_takes_the_steps_of_the_reference(angle, held):
+    torch.manual_seed(3)
+    kinds = KINDS * 2
+    axes = torch.nn.functional.normalize(torch.randn(len(kinds), 3).double(), dim=1)
+    T = torch.stack([se3.from_screw(a, torch.randn(3).double(), angle) for a in axes])
+    T[[2, 5], :3, :3] = torch.eye(3).double()
+    axes[:2] = torch.nan
+    radius, on = torch.rand(len(kinds)) + 0.1, torch.ones(len(kinds)).bool()
+    fast, slow = (MotionSteps(kinds, radius, 0.02, axes if held else None) for _ in range(2))
+    a = b = T
+    for step in range(20):
+        gradient, centre = torch.randn(len(kinds), 6).double(), torch.randn(len(kinds), 3).double()
+        on[4] = step % 3 > 0
+        a = fast.take(a, gradient, centre, step / 20, on)
+        b = slow.take_reference(b, gradient, centre, step / 20, on)
+        assert torch.allclose(a, b, rtol=0, atol=1e-12)
+        a = b  # half a turn's axis has either sign, and steps would go on from one of two motions
+    assert torch.equal(fast.taken, slow.taken) and float(fast.taken[4]) == 13
+    assert not torch.allclose(a, T, atol=1e-2)
 
 
 @pytest.mark.parametrize("ways", ["forward", "backward", "both"])

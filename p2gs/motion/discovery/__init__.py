@@ -13,7 +13,7 @@ from p2gs.motion.discovery.proposals import (
     relabel,
     surface_energy,
 )
-from p2gs.motion.discovery.result import Candidate, Discovery, FoundMotion
+from p2gs.motion.discovery.result import Candidate, Discovery, FoundMotion, Near
 from p2gs.motion.discovery.rigid import axes_used
 from p2gs.visibility.depth_stack import StateEvidence
 
@@ -22,6 +22,7 @@ __all__ = [
     "Discovery",
     "DiscoveryConfig",
     "FoundMotion",
+    "Near",
     "StateEvidence",
     "as_motions",
     "axes_used",

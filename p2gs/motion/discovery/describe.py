@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from p2gs.motion.discovery.explanations import masses
@@ -65,7 +63,7 @@ def found_motions(problem: Problem, motions: Motions, labelling: Labelling) -> l
 def nearest_evidence(problem: Problem, points: Tensor, state: int) -> Tensor:
     """1 moved, 0 static, -1 unknown, of the surfel nearest to each point."""
     surf = problem.surfels[state]
-    j = torch.from_numpy(np.asarray(cKDTree(surf.points.numpy()).query(points.detach().cpu().float().numpy())[1]))
+    j = surf.nearest(points, 1)[1][:, 0]
     e = torch.full((len(surf),), -1, dtype=torch.long)
     e[problem.static[state]] = 0
     e[problem.moved[state]] = 1

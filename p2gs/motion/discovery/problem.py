@@ -106,9 +106,7 @@ def evidence_masks(
         m, still = classify(free, on, need=min(3.0, max(1.0, len(stacks[1 - s]) / 8)))
         m = smooth_mask(surfels[s].points, m)
         other = surfels[1 - s]
-        d, j = cKDTree(other.points.numpy()).query(surfels[s].points.numpy(), k=min(4, len(other)))
-        j = torch.from_numpy(np.asarray(j).reshape(len(surfels[s]), -1))
-        d = torch.from_numpy(np.asarray(d).reshape(len(surfels[s]), -1))
+        d, j = other.nearest(surfels[s].points, 4)
         like = ((other.normals[j] * surfels[s].normals[:, None]).sum(2) > 0.7) & (
             d < 2 * max(surfels[0].spacing, surfels[1].spacing)
         )
@@ -133,9 +131,7 @@ def credibility(surfels: Surfels, other: Surfels, stack: DepthStack, moved: Tens
         return out
     p, n = surfels.points[index], surfels.normals[index]
     far = ((stack.excess(p, scale.tau) - 1.3) / 2.0).clamp(0.1, 1)
-    j = torch.from_numpy(
-        np.asarray(cKDTree(other.points.numpy()).query(p.numpy(), k=min(24, len(other)))[1]).reshape(len(p), -1)
-    )
+    j = other.nearest(p, 24)[1]
     d = other.points[j] - p[:, None]
     across = (d * n[:, None]).sum(2).abs()
     along = (d.pow(2).sum(2) - across**2).clamp_min(0).sqrt()
@@ -147,10 +143,9 @@ def credibility(surfels: Surfels, other: Surfels, stack: DepthStack, moved: Tens
 def disagreement(surfels: list[Surfels], limit: float) -> float:
     """Robust standard deviation of one state's surface about the other's where both lie within ``limit``: most of it
     never moved."""
-    near, j = cKDTree(surfels[1].points.numpy()).query(surfels[0].points.numpy())
-    j = torch.from_numpy(j)
+    near, j = (x[:, 0] for x in surfels[1].nearest(surfels[0].points, 1))
     d = ((surfels[1].points[j] - surfels[0].points) * surfels[1].normals[j]).sum(1).abs()
-    ok = (torch.from_numpy(near) < limit) & ((surfels[1].normals[j] * surfels[0].normals).sum(1) > 0.8)
+    ok = (near < limit) & ((surfels[1].normals[j] * surfels[0].normals).sum(1) > 0.8)
     return float(MEDIAN_SIGMA * d[ok].median()) if ok.sum() > 20 else 0.0
 
 

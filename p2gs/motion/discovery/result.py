@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from p2gs.types import JointType
@@ -27,6 +25,27 @@ class FoundMotion:
     amount: float
     confidence: float
     mass: float
+
+
+@dataclass(frozen=True)
+class Near:
+    """Of N points: the surfels [N, k] nearest to each, their weights [N, k] (sum 1), the distance [N] to the
+    nearest."""
+
+    index: Tensor
+    weight: Tensor
+    distance: Tensor
+
+    @classmethod
+    def surfels(cls, surfels: Surfels, points: Tensor, colours: Tensor | None, count: int = 5) -> Near:
+        """The ``count`` surfels nearest to points [N, 3], near ones and (colours [N, 3] or None) like ones weighing
+        more."""
+        d, j = surfels.nearest(points, count)
+        d = d.float()
+        w = 1 / (d**2 + (0.1 * surfels.spacing) ** 2 + 1e-12)
+        if colours is not None:
+            w = w * torch.exp(-3 * (surfels.colours[j] - colours.detach().cpu().float()[:, None]).abs().mean(2))
+        return cls(j, w / w.sum(1, keepdim=True), d[:, 0])
 
 
 @dataclass
@@ -52,27 +71,17 @@ class Candidate:
         colours [N, 3] (or None) favour surfels that look alike. The margin falls with the distance to the nearest
         surfel.
         """
-        p, d = self.point_probability(points, colours, state, neighbours)
+        return self.label_by(Near.surfels(self.surfels[state], points, colours, neighbours), state)
+
+    def label_by(self, near: Near, state: int) -> tuple[Tensor, Tensor]:
+        """``label_points`` of points whose nearest surfels are known."""
+        p = torch.einsum("nk,nkc->nc", near.weight, self.probability[state][near.index])
         label = p.argmax(1)
         if p.shape[1] == 1:
-            return label, torch.ones(len(points))
+            return label, torch.ones(len(label))
         top = p.topk(2, dim=1).values
-        near = torch.exp(-((d / (3 * self.surfels[state].spacing)) ** 2))
-        return label, (top[:, 0] - top[:, 1]) * near
-
-    def point_probability(
-        self, points: Tensor, colours: Tensor | None, state: int, neighbours: int = 5
-    ) -> tuple[Tensor, Tensor]:
-        """Probabilities [N, K + 1] of any points and the distance [N] to the nearest surfel."""
-        surf = self.surfels[state]
-        d, j = cKDTree(surf.points.numpy()).query(points.detach().cpu().float().numpy(), k=min(neighbours, len(surf)))
-        d = torch.from_numpy(np.asarray(d, np.float32).reshape(len(points), -1))
-        j = torch.from_numpy(np.asarray(j).reshape(len(points), -1))
-        w = 1 / (d**2 + (0.1 * surf.spacing) ** 2 + 1e-12)
-        if colours is not None:
-            w = w * torch.exp(-3 * (surf.colours[j] - colours.detach().cpu().float()[:, None]).abs().mean(2))
-        w = w / w.sum(1, keepdim=True)
-        return torch.einsum("nk,nkc->nc", w, self.probability[state][j]), d[:, 0]
+        close = torch.exp(-((near.distance / (3 * self.surfels[state].spacing)) ** 2))
+        return label, (top[:, 0] - top[:, 1]) * close
 
 
 @dataclass

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from p2gs.motion.discovery.fields import Landing
@@ -82,8 +81,7 @@ def meetings(
     gains = light.gains(labels, n if state else surf.normals[rows])
     colours *= (1 / gains if state else gains)[:, None]
     free, on, _ = stack.counts(x, problem.scale.tp, stack.spread(VIEWS))
-    d, j = cKDTree(other.points.numpy()).query(x.numpy(), k=min(NEIGHBOURS, len(other)))
-    d, j = (torch.from_numpy(a.reshape(len(x), -1)) for a in (d, j))
+    d, j = other.nearest(x, NEIGHBOURS)
     same = same_place(places, x, problem.scale.apart).gather(1, labelling.labels(1 - state)[j])
     own = same & (d < 2 * problem.scale.spacing + problem.scale.tp + thick[:, None])
     other_side = own & ((other.normals[j] * n[:, None]).sum(2) < 0) & (thick[:, None] > 0)
