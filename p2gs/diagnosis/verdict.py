@@ -122,7 +122,8 @@ def _discovery(d: dict, say) -> None:
         say("discovery", "No motion explains what moved: no moving part was found.")
     if found["chosen"] is not None and len(found["explanations"]) > 1:
         ranks = [e["rank"] for e in found["explanations"]]
-        gap = min(r for i, r in enumerate(ranks) if i != found["chosen"]) - ranks[found["chosen"]]
+        # one that was dismissed for its further part may have the lower energy
+        gap = min(abs(r - ranks[found["chosen"]]) for i, r in enumerate(ranks) if i != found["chosen"])
         if gap < limit("close_call"):
             text = (
                 f"Two explanations fit almost alike (energies {gap:.3f} apart): other parts are possible (try "

@@ -26,10 +26,10 @@ from p2gs.parts.bodies import Surfaces, looked_through, one_part_a_body
 from p2gs.parts.expand import expand
 from p2gs.parts.fronts import part_fronts
 from p2gs.parts.options import PartMotionsConfig
-from p2gs.parts.part_choices import join_twins, settle_types, simplify
+from p2gs.parts.part_choices import better, settle_types, simplify
 from p2gs.parts.seams import join_seamless
 from p2gs.parts.seek import seek
-from p2gs.parts.settle import drop_unfounded, reconsider, settle_labels
+from p2gs.parts.settle import reconsider, settle_labels
 from p2gs.parts.side_by_side import part_side_by_side
 from p2gs.parts.slots import merge_to
 from p2gs.types import TwoStateScene, UserError
@@ -71,13 +71,7 @@ def find_part_motions(
     say("settling labels and motions")
     motions, rounds = settle_labels(judge, motions, config)
     motions, neighbours = _neighbours(judge, found, motions, sharpened or states, limit)
-    motions, unfounded = drop_unfounded(judge, motions, config.min_confidence)
     motions, _, laid = lay_axes(judge, motions, config.askew, config.part_penalty)
-    for part in unfounded:
-        say(
-            f"a {part['type']} part was dropped: one of the states shows next to nothing of it (confidence "
-            f"{part['confidence']:.2f})"
-        )
     motions.diagnostics = {
         "first_looks": looks,
         # of the Gaussians above min_opacity
@@ -88,7 +82,6 @@ def find_part_motions(
         **improved,
         "rounds": rounds,
         **neighbours,
-        "unfounded": unfounded,
         "laid": laid,
         **_plain(found.diagnostics),
     }
@@ -125,7 +118,7 @@ def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say)
 
 
 def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
-    """The explanation of lowest energy, refined and without parts that it is better without; which it was, and of each
+    """The best explanation (``better``), refined and without parts that it is better without; which it was, and of each
     the image loss and how much higher its energy is ("rank")."""
     if len(explanations) > 1:
         say(f"re-rendering {len(explanations)} explanations")
@@ -139,7 +132,7 @@ def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) 
     looked, chosen = at_once(simplified, explanations), 0
     refined, tried = [motions for motions, _ in looked], [told for _, told in looked]
     for number, motions in enumerate(refined):
-        if judge.gain(motions, refined[chosen]) > 0:
+        if better(judge, motions, refined[chosen]):
             chosen = number
     for one, motions in zip(tried, refined, strict=True):
         one["rank"] = judge.gain(refined[chosen], motions)
@@ -175,16 +168,13 @@ def _neighbours(
     """Parts that touch and go alike as one where they are one body, as two where they are two; what was done."""
     states, problem, apart = judge.states, found.problem, found.problem.scale.apart
     surfels, look = problem.surfels, partial(looked_through, stacks=problem.stacks, tau=problem.scale.tau)
-    motions, joined = join_twins(states, motions, apart)
-    if joined:
-        motions = judge.refine(motions)
     faced = directions_of(states, motions) if "prismatic" in motions.types else torch.zeros(0, 3).double()
     motions, beside = part_side_by_side(states, surfels, motions, faced, apart, limit, look)
     if beside:
         motions = judge.improved(motions)[2]
     motions, seamless = join_seamless(judge, motions)
     motions, fronts = part_fronts(judge, sharpened, surfels, motions, faced, apart, limit)
-    return motions, {"joined": joined, "side_by_side": beside, "seamless": seamless, "fronts": fronts}
+    return motions, {"side_by_side": beside, "seamless": seamless, "fronts": fronts}
 
 
 def _bodies(judge: Judge, motions: PartMotions, limit: int) -> tuple[PartMotions, list[dict]]:

@@ -29,8 +29,6 @@ class PartMotionsConfig:
     seek: surface that no motion explains is then searched by itself for further parts, however small; share of the
     image loss in its own pixels that such a part must save (0: none is sought). False ones saved up to 0.27, latches
     of a hundredth of the moved surface 0.38.
-    min_confidence: a part of less confidence is dropped in the end (0 = none is): one of the states shows next to
-    nothing of it.
     askew: share of the image loss that an axis must save which is askew to the directions that the object has, against
     one along them (0: axes stay), or part_penalty in its own pixels where it is far from them.
     """
@@ -48,7 +46,6 @@ class PartMotionsConfig:
     rounds: int = 2
     reconsider: bool = True
     seek: float = 0.3
-    min_confidence: float = 0.02
     askew: float = 0.01
     search: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     coarse: PolishConfig = field(default_factory=lambda: PolishConfig(steps=150, levels=[100, 200], rate=1e-2))

@@ -95,23 +95,20 @@ def own_shares(judge: Judge, motions: PartMotions) -> list[float]:
     return out
 
 
+def better(judge: Judge, tried: PartMotions, than: PartMotions) -> bool:
+    """Is the energy of ``tried`` lower? One that has more axes than the other must save ``judge.further`` of the image
+    loss in its own pixels (``Judge.own_share``) against it as well, or is none the better."""
+    more = axes_used(as_motions(tried.transforms, tried.types)) - axes_used(as_motions(than.transforms, than.types))
+    if more < 0:
+        return not better(judge, than, tried)
+    return judge.gain(tried, than) > 0 and (more == 0 or judge.own_share(tried, than) >= judge.further)
+
+
 def lonely(states, more: PartMotions, fewer: PartMotions, part: int) -> bool:
     """Is there an axis less with ``fewer`` than with ``more``, in which ``part`` is new? Of a row of drawers, or of
     doors on one hinge line, each saves little, and has the axis of the others."""
     used = [axes_used(as_motions(m.transforms, m.types)) for m in (more, fewer)]
     return used[0] > used[1] and has_own_axis(states, more, part, coarse=True)
-
-
-def join_twins(states, motions: PartMotions, reach: float) -> tuple[PartMotions, list[dict]]:
-    """One part for every two that touch and whose motions carry the smaller one's points to within ``reach`` (internal
-    units) of each other: nothing tells them from one body.  Returns the motions and the types of those that went, with
-    the parts that they joined."""
-    log: list[dict] = []
-    while (pair := next((c for c in _reductions(states, motions, reach) if c[0][0] == "merge"), None)) is not None:
-        (_, small, into), reduced = pair
-        log.append({"type": motions.types[small], "into": into - 1})
-        motions = reduced
-    return motions, log
 
 
 def _reductions(states, motions: PartMotions, same_motion: float, joins: bool = False):

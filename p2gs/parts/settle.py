@@ -18,7 +18,7 @@ from p2gs.native import at_once
 from p2gs.ops import se3
 from p2gs.parts.islands import settle_islands
 from p2gs.parts.options import PartMotionsConfig
-from p2gs.parts.part_choices import lonely, settle_types, without_part
+from p2gs.parts.part_choices import lonely, settle_types
 
 # Of a proposal's energy (a log ratio of image losses), the most by which refining is taken to lower it: of 245
 # proposals on fourteen objects no accepted one stood above 0.042 before it, and none of the 88 above this came so low.
@@ -157,19 +157,3 @@ def _settled(
         return None
     _, reached, tried = judge.improved(replace(tried, labels=labels))
     return count, reached, judge.gain(tried, motions), tried
-
-
-def drop_unfounded(judge: Judge, motions: PartMotions, least: float) -> tuple[PartMotions, list[dict]]:
-    """Without the parts whose confidence is below ``least``, the least first; labels are chosen anew and motions
-    refined.
-
-    A part that only one state shows has a motion that nothing was observed of: it may explain the other state's
-    photographs a little better (by hiding junk), and is no finding. Returns the motions, and type and confidence of
-    each that went.
-    """
-    gone: list[dict] = []
-    while len(motions) and float(motions.confidence.min()) < least:
-        k = int(motions.confidence.argmin())
-        gone.append({"type": motions.types[k], "confidence": float(motions.confidence[k])})
-        motions = relabelled(judge.found, judge.states, without_part(motions, k, 0))
-    return (judge.refine(motions) if gone else motions), gone

@@ -221,27 +221,3 @@ def test_two_bodies_with_amounts_of_their_own_are_taken_where_the_energy_falls(m
         )
         found, log = settle.reconsider(judge_of(states, views), motions, 2, PartMotionsConfig())
         assert len(found) == parts and log[0]["change"] == "parted"
-
-
-def test_a_part_of_which_one_state_shows_nothing_is_dropped(monkeypatch):
-    states, labels, views = two_states(slide())
-    margins, told = [torch.ones(len(labels))] * 2, []
-
-    def relabel(found, transforms, types):
-        told.append(list(types))
-        return SimpleNamespace(motions=[SimpleNamespace(confidence=0.5)] * len(types))
-
-    monkeypatch.setattr("p2gs.motion.relabel.relabel", relabel)
-    monkeypatch.setattr("p2gs.motion.relabel.label_gaussians", lambda *a: ([labels, labels], margins))
-    judge = judge_of(states, views)
-    two = PartMotions(
-        ["revolute", "prismatic"], torch.stack([hinge(), slide()]), torch.tensor([0.01, 0.4]), [labels * 2] * 2, margins
-    )
-    kept, gone = settle.drop_unfounded(judge, two, 0.02)
-    assert kept.types == ["prismatic"] and told == [["prismatic"]]
-    assert gone == [{"type": "revolute", "confidence": pytest.approx(0.01)}]
-    assert float((kept.transforms[0] - slide()).norm()) < 0.01
-    same, gone = settle.drop_unfounded(judge, kept, 0.02)
-    assert same is kept and gone == []
-    none, gone = settle.drop_unfounded(judge, two, 0.0)
-    assert none is two and gone == []
