@@ -228,12 +228,14 @@ class Joint:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the twin. ``joint`` is None for the static base (id 0)."""
+    """A part of the twin. ``joint`` is None for the static base (id 0).  alternatives: other joints that explain the
+    photographs as well."""
 
     id: int
     joint: Optional[Joint] = None
     gaussians: int = 0
     confidence: float = 1.0
+    alternatives: tuple[Joint, ...] = ()
 
 
 @dataclass

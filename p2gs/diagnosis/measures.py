@@ -17,7 +17,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import Articulation, CanonicalGaussians, PartMotions, StateGaussians
 from p2gs.gaussians.pose import carry, with_static
-from p2gs.models.finish import FinishRecord
+from p2gs.models.finish_record import FinishRecord
 from p2gs.motion.joint_confidence import (
     ON_SURFACE,
     CrossViews,

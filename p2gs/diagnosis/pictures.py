@@ -13,7 +13,7 @@ from p2gs.export.pages.media import beside, captioned, fit
 from p2gs.gaussians.handover import StateGaussians
 from p2gs.gaussians.paint import draw, part_coloured, to_image
 from p2gs.gaussians.pose import pose
-from p2gs.models.finish import FinishRecord
+from p2gs.models.finish_record import FinishRecord
 from p2gs.motion.screw_polish import MovedGaussians
 from p2gs.ops import se3
 from p2gs.types import ArticulatedObject, Camera, GaussianTensors

@@ -41,10 +41,18 @@ def joint_to_input(joint: Joint, similarity: Similarity) -> Joint:
     )
 
 
+def part_to_input(part: Part, similarity: Similarity) -> Part:
+    """A part with its joint and their alternatives in input coordinates."""
+    if part.joint is None:
+        return part
+    joint, *others = (joint_to_input(j, similarity) for j in (part.joint, *part.alternatives))
+    return replace(part, joint=joint, alternatives=tuple(others))
+
+
 def object_to_input(obj: ArticulatedObject) -> ArticulatedObject:
     """The whole twin in input coordinates, on the CPU, with the identity similarity."""
     gaussians = gaussians_to_input(obj.gaussians.detach(), obj.similarity)
-    parts = [p if p.joint is None else replace(p, joint=joint_to_input(p.joint, obj.similarity)) for p in obj.parts]
+    parts = [part_to_input(p, obj.similarity) for p in obj.parts]
     gaussians = GaussianTensors(*(getattr(gaussians, n).cpu() for n in GaussianTensors.NAMES))
     return ArticulatedObject(
         gaussians, obj.part_ids.detach().cpu().long(), parts, float(obj.canonical_time), Similarity()

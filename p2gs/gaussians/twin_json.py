@@ -84,22 +84,21 @@ def load_twin(run_dir: Path | str) -> ArticulatedObject:
 
 
 def _part_dict(part: Part) -> dict:
+    measured = {"gaussians": part.gaussians, "confidence": float(part.confidence)}
     if part.joint is None:
-        return {"id": part.id, "kind": "static", "gaussians": part.gaussians, "confidence": float(part.confidence)}
-    joint = part.joint
+        return {"id": part.id, "kind": "static", **measured}
+    others = [_joint_dict(j) for j in part.alternatives]
+    return {"id": part.id, "kind": "movable", "joint": _joint_dict(part.joint), **measured, "alternatives": others}
+
+
+def _joint_dict(joint: Joint) -> dict:
     return {
-        "id": part.id,
-        "kind": "movable",
-        "joint": {
-            "type": joint.type,
-            "axis": joint.axis.tolist(),
-            "origin": joint.origin.tolist(),
-            "motion": joint.motion,
-            "limits": list(joint.limits),
-            "transform": joint.transform.tolist(),
-        },
-        "gaussians": part.gaussians,
-        "confidence": float(part.confidence),
+        "type": joint.type,
+        "axis": joint.axis.tolist(),
+        "origin": joint.origin.tolist(),
+        "motion": joint.motion,
+        "limits": list(joint.limits),
+        "transform": joint.transform.tolist(),
     }
 
 
@@ -112,7 +111,12 @@ def _read_part(data: dict, number: int) -> Part:
         raise ValueError(f"gaussians {count}, confidence {confidence}")
     if number == 0:
         return Part(0, None, count, confidence)
-    j = data["joint"]
+    joint, *others = (_read_joint(j) for j in (data["joint"], *data.get("alternatives", [])))
+    return Part(number, joint, count, confidence, tuple(others))
+
+
+def _read_joint(j: dict) -> Joint:
+    """The joint. Raises as ``_read_part``."""
 
     def tensor(key: str, *shape: int) -> torch.Tensor:
         value = torch.tensor(j[key], dtype=torch.float64)
@@ -120,15 +124,11 @@ def _read_part(data: dict, number: int) -> Part:
             raise ValueError(f"{key} {short(j[key])}")
         return value
 
-    axis, transform, low, high = (
-        tensor("axis", 3),
-        tensor("transform", 4, 4),
-        float(j["limits"][0]),
-        float(j["limits"][1]),
-    )
+    axis, transform = tensor("axis", 3), tensor("transform", 4, 4)
+    low, high = float(j["limits"][0]), float(j["limits"][1])
     motion = float(j["motion"])
     if j["type"] not in ("revolute", "prismatic") or abs(float(axis.norm()) - 1) > 1e-3:
         raise ValueError(f"type {short(j['type'])}, axis {short(j['axis'])}")
     if not (math.isfinite(motion) and math.isfinite(low) and math.isfinite(high) and low <= high):
         raise ValueError(f"motion {motion}, limits {low}, {high}")
-    return Part(number, Joint(j["type"], axis, tensor("origin", 3), motion, (low, high), transform), count, confidence)
+    return Joint(j["type"], axis, tensor("origin", 3), motion, (low, high), transform)

@@ -3,7 +3,7 @@ joints."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal, Sequence
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from p2gs.gaussians.handover import Articulation, PartMotions, StateGaussians
 from p2gs.losses.base import Loss
+from p2gs.models.finish_record import FinishRecord, measure
 from p2gs.models.joint_of import constrain, make_joint, name_types
 from p2gs.models.together import fit_together
 from p2gs.models.tune import TuneConfig, tune
@@ -23,17 +24,18 @@ from p2gs.models.twin_labels import (
     surviving_slots,
     with_mass,
 )
+from p2gs.motion.alternatives import other_angles
 from p2gs.motion.directions import shared_axes
-from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints, state_depth
+from p2gs.motion.joint_confidence import common_level, state_depth
 from p2gs.motion.joint_range import extend_ranges
 from p2gs.motion.refine_motions import Judge, single_ways
-from p2gs.motion.screw_polish import PolishConfig, photometric_cost
+from p2gs.motion.screw_polish import PolishConfig
 from p2gs.motion.survey import leave_false_minima
 from p2gs.ops import se3
 from p2gs.parts.askew import keep_axes, lay_axes, on_axes
 from p2gs.parts.fronts import weighed_amounts
 from p2gs.parts.options import PartMotionsConfig
-from p2gs.parts.part_choices import drop_needless, drop_untold, own_shares, settle_types
+from p2gs.parts.part_choices import drop_needless, drop_untold, settle_types
 from p2gs.types import ArticulatedObject, GaussianTensors, Part, Similarity
 
 EMPTY = "vanished: no Gaussians of its own, or no motion"
@@ -89,33 +91,6 @@ class FinishConfig:
     closed: bool = False
     whole: Literal["joined", "separate"] = "joined"
     cluster: float = 0.0
-
-
-@dataclass
-class FinishRecord:
-    """What the last stage measured, for the diagnosis.
-
-    labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the
-    polish (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
-    start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.
-    together: image loss with screws held and free (``fit_together``; {}: not tried).
-    laid: axes that were tried along the object's directions (``lay_axes``).  fronts: of slides, what their fronts said
-    (``weighed_amounts``).  slots: the learned slot of each part.
-    contents: Gaussians that became a drawer's because they are on or in its tray.
-    """
-
-    labels: list[Tensor]
-    margin: list[Tensor]
-    before: Tensor
-    after: Tensor
-    polish: dict = field(default_factory=dict)
-    costs: dict[str, list[float]] = field(default_factory=dict)
-    evidence: list[JointEvidence] = field(default_factory=list)
-    slots: list[int] = field(default_factory=list)
-    contents: int = 0
-    laid: list[dict] = field(default_factory=list)
-    fronts: list[dict] = field(default_factory=list)
-    together: dict[str, float] = field(default_factory=dict)
 
 
 def finish(
@@ -176,9 +151,11 @@ def finish(
         notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
         refined = _with_gaussians(record, judge, refined, learned, labels, axes, config, level)
         types, transforms = refined.types, refined.transforms
+        record.others = other_angles(judge, refined, config.part_penalty)
     options["backend"] = twin_backend or backend
     gaussians = tune(learned.gaussians, labels, transforms, time, views, losses or {}, config.tune, **options)
-    twin = assemble(gaussians, labels, types, transforms, time, similarity, [e.confidence for e in record.evidence])
+    trust = [e.confidence for e in record.evidence]
+    twin = assemble(gaussians, labels, types, transforms, time, similarity, trust, record.others)
     if config.extend_range:
         twin.parts = extend_ranges(twin)
     return twin, notes, record
@@ -287,31 +264,17 @@ def assemble(
     transforms: Tensor,
     time: float,
     similarity: Similarity,
-    confidence: Sequence[float] | None = None,
+    confidence: Sequence[float] = (),
+    others: Sequence[list[Tensor]] = (),
 ) -> ArticulatedObject:
-    """A twin from Gaussians at canonical ``time``, labels [N], and a motion start -> end [K, 4, 4] per moving part."""
+    """A twin from Gaussians at canonical ``time``, labels [N], and of each moving part its motion start -> end [K, 4,
+    4], confidence (none given: 1) and other motions that explain as much."""
     parts = [Part(0, None, int((labels == 0).sum()))]
     for k, kind in enumerate(types):
         rows = labels == k + 1
         centre = g.means[rows].double().mean(0)
-        joint = make_joint(kind, transforms[k], se3.apply(se3.screw_at(transforms[k], -time), centre[None])[0])
-        parts.append(Part(k + 1, joint, int(rows.sum()), 1.0 if confidence is None else confidence[k]))
+        at_start = se3.apply(se3.screw_at(transforms[k], -time), centre[None])[0]
+        joint, *alternatives = (make_joint(kind, T, at_start) for T in [transforms[k], *(others[k] if others else [])])
+        trust = confidence[k] if confidence else 1.0
+        parts.append(Part(k + 1, joint, int(rows.sum()), trust, tuple(alternatives)))
     return ArticulatedObject(g, labels, parts, time, similarity)
-
-
-def measure(record: FinishRecord, judge: Judge, motions: PartMotions, level: int) -> None:
-    """Fill in ``costs`` and ``evidence`` of the final motions. level: image size."""
-    states, views = judge.states, judge.views
-    options = {"level": level, "backend": judge.backend, "device": judge.device}
-    for name, T in (("before", record.before), ("after", record.after)):
-        ways = (T, se3.inverse(T))
-        record.costs[name] = [
-            photometric_cost(states[s].gaussians, record.labels[s], ways[s], views[1 - s], count=8, **options)
-            for s in (0, 1)
-        ]
-    both = [record.polish[w] for w in ("forward", "backward")] if "backward" in record.polish else None
-    known = [m >= 0 for m in record.margin]
-    shown = [replace(s, gaussians=s.gaussians[k]) for s, k in zip(states, known, strict=True)]
-    labels = [x[k] for x, k in zip(record.labels, known, strict=True)]
-    found = measure_joints(shown, labels, record.after, motions.types, views, judge.stacks, both=both, **options)
-    record.evidence = [replace(e, saved=own) for e, own in zip(found, own_shares(judge, motions), strict=True)]

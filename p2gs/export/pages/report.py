@@ -84,6 +84,8 @@ def joint_section(obj: ArticulatedObject, metrics: Optional[dict]) -> str:
         else:
             revolute = j.type == "revolute"
             reach = f"{j.motion:.1f}&deg;" if revolute else f"{j.motion:.3f}"
+            # an alternative has the same axis, in one sense or the other
+            reach += "".join(f" or {o.motion * float((o.axis @ j.axis).sign()):.0f}&deg;" for o in part.alternatives)
             through = _vector(j.origin) if revolute else ""
             cells = [
                 f"{chip(part.id)}{part.id}",
