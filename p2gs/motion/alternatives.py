@@ -25,12 +25,15 @@ def other_angles(judge: Judge, motions: PartMotions, told: float) -> list[list[T
     Where the small photographs' loss has a valley along the angle, large ones say where in it; of the valleys, the
     lowest first, the first one that is told ends the search.
     """
+    if told <= 0 or "revolute" not in motions.types:
+        return [[] for _ in motions.types]
+    judge.seen(motions)  # once, and not in each thread
     return at_once(partial(_of, judge, motions, told), range(len(motions)))
 
 
 def _of(judge: Judge, motions: PartMotions, told: float, k: int) -> list[Tensor]:
     """``other_angles`` of part ``k``."""
-    if motions.types[k] != "revolute" or told <= 0:
+    if motions.types[k] != "revolute":
         return []
     screw = se3.screw_parameters(motions.transforms[k].double())
 

@@ -445,3 +445,12 @@ def test_what_arrives_on_surface_of_unknown_fate_need_not_be_answered():
         swept = Sweep(motions, evidence, [torch.arange(2)] * 2, one_sided)
         assert swept.gain([half, half]).tolist() == pytest.approx([0.03, unknown, 2 * 254 / 255])
         assert swept.gain([half, half], unknown=True).tolist() == pytest.approx([0.03, 1.0, 2 * 254 / 255])
+
+
+@pytest.mark.parametrize("k", [1, 3, 9])
+def test_nearest_surfels_are_those_of_all_distances(k):
+    points, asked = torch.rand(7, 3), torch.rand(5, 3)
+    surfels = Surfels(points, points, points, 0.1, 0.0)
+    distance, index = surfels.nearest(asked, k)
+    expected = torch.cdist(asked.double(), points.double()).topk(min(k, 7), largest=False)
+    assert torch.equal(index, expected.indices) and torch.allclose(distance, expected.values, atol=1e-6)

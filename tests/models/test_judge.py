@@ -12,7 +12,7 @@ from p2gs.data.views import TrainingViews
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.motion.difference import weighted_loss
 from p2gs.motion.joint_confidence import state_depth
-from p2gs.motion.refine_motions import Judge, explanation_cost, what_counts
+from p2gs.motion.refine_motions import Judge, Latest, explanation_cost, what_counts
 from p2gs.motion.screw_polish import PolishConfig
 from p2gs.ops import se3
 from p2gs.ops.carry import Parts, carry
@@ -32,6 +32,32 @@ def panels():
         for T in (slide(), behind)
     ]
     return Judge(None, states, views, CONFIG, stacks, 0, "auto"), *motions
+
+
+def test_what_was_asked_lately_is_not_worked_out_again():
+    asked, latest = [], Latest(2)
+    one, other = object(), object()
+
+    def answer(of, also=None):
+        return latest(of, lambda: asked.append((of, also)) or len(asked), also)
+
+    assert [answer(one, "a"), answer(one, "a"), answer(one, "b"), answer(one, "a")] == [1, 1, 2, 1]
+    assert [answer(other), answer(one, "a"), answer(one, "b")] == [3, 1, 4]  # the longest unasked one went
+
+
+def test_refinement_and_a_glance_look_at_what_the_judge_saw(monkeypatch):
+    judge, true, _ = panels()
+    judge.config = replace(CONFIG, steps=2)
+    looks = []
+    monkeypatch.setattr(
+        "p2gs.motion.refine_motions.what_counts", lambda *a, **o: looks.append(a[1]) or what_counts(*a, **o)
+    )
+    seen = judge.seen(true)
+    assert judge.at_a_glance(1).seen(true) is seen
+    refined = judge.refine(true)
+    assert looks == [true]
+    judge.gain(refined, true)
+    assert looks == [true, refined]
 
 
 def test_gain_is_of_the_pixels_of_both():
