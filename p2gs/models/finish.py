@@ -4,6 +4,7 @@ joints."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, Literal, Sequence
 
 import torch
@@ -35,7 +36,7 @@ from p2gs.ops import se3
 from p2gs.parts.askew import keep_axes, lay_axes, on_axes
 from p2gs.parts.fronts import weighed_amounts
 from p2gs.parts.options import PartMotionsConfig
-from p2gs.parts.part_choices import drop_needless, drop_untold, settle_types
+from p2gs.parts.part_choices import drop_needless, drop_untold, needless, settle_types
 from p2gs.types import ArticulatedObject, GaussianTensors, Part, Similarity
 
 EMPTY = "vanished: no Gaussians of its own, or no motion"
@@ -147,9 +148,8 @@ def finish(
         judge = Judge(None, states, views, config.polish, stacks, **options)
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         refined, axes, record.laid = _refined(judge, motions, axes, config)
-        refined, labels, axes, left = _founded(record, judge, refined, labels, axes, config, level)
+        refined, labels, left = _needed(record, judge, refined, learned, labels, axes, config, level)
         notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
-        refined = _with_gaussians(record, judge, refined, learned, labels, axes, config, level)
         types, transforms = refined.types, refined.transforms
         record.others = other_angles(judge, refined, config.part_penalty)
     options["backend"] = twin_backend or backend
@@ -196,6 +196,31 @@ def _refined(
     refined, held, laid = lay_axes(judge, refined, config.askew, config.part_penalty)
     axes = torch.where(held.isnan(), axes, held)
     return keep_axes(judge, refined, axes), axes, laid
+
+
+def _needed(
+    record: FinishRecord,
+    judge: Judge,
+    motions: PartMotions,
+    learned: Articulation,
+    labels: Tensor,
+    axes: Tensor,
+    config: FinishConfig,
+    level: int,
+) -> tuple[PartMotions, Tensor, list[tuple[int, str]]]:
+    """The motions of the parts that are worth being ones (``_founded``), fitted together with the Gaussians
+    (``_with_gaussians``), again without those that then save less than they must; the twin's labels [N], and slot and
+    reason of each that vanished."""
+    left: list[tuple[int, str]] = []
+    for number in count():
+        before = len(motions)
+        motions, labels, axes, gone = _founded(record, judge, motions, labels, axes, config, level)
+        left += gone
+        motions = _with_gaussians(record, judge, motions, learned, labels, axes, config, level)
+        saved = [e.saved for e in record.evidence]
+        if not needless(judge.states, motions, saved, config.part_penalty) or (number and len(motions) == before):
+            break
+    return motions, labels, left
 
 
 def _founded(

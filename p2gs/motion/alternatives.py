@@ -9,6 +9,7 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
+from p2gs.motion.joint_confidence import common_level
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import photometric_cost
 from p2gs.native import at_once
@@ -22,7 +23,7 @@ def other_angles(judge: Judge, motions: PartMotions, told: float) -> list[list[T
     ``told`` of the image loss in its own pixels (``Judge.own_share``; 0: none), those that photographs like best first.
     Slides have none.
 
-    Where the small photographs' loss has a valley along the angle, large ones say where in it; of the valleys, the
+    Where the smallest photographs' loss has a valley along the angle, larger ones say where in it; of the valleys, the
     lowest first, the first one that is told ends the search.
     """
     if told <= 0 or "revolute" not in motions.types:
@@ -46,7 +47,7 @@ def _of(judge: Judge, motions: PartMotions, told: float, k: int) -> list[Tensor]
         sides = zip(judge.states, tried.labels, ways, (judge.views[1], judge.views[0]), strict=True)
         return sum(photometric_cost(s.gaussians, of, T, views, **options) for s, of, T, views in sides)
 
-    step, small, large = 2 * math.pi / LOOKS, min(judge.views[0].levels), judge.config.levels[-1]
+    step, small, large = 2 * math.pi / LOOKS, min(judge.views[0].levels), common_level(judge.views)
     losses = [loss(i * step, small) for i in range(LOOKS)]
     valleys = [i for i in range(2, LOOKS - 1) if losses[i] <= min(losses[i - 1], losses[i + 1])]
     out = []

@@ -72,6 +72,18 @@ def drop_needless(
     return judge.improved(fewer)[2] if gone else motions, labels, gone
 
 
+def needless(states, motions: PartMotions, saved: list[float | None], penalty: float) -> list[int]:
+    """The parts of several that save less in their own pixels than ``drop_needless`` asks of them. saved: of each, as
+    ``own_shares`` has it (None: not asked)."""
+    out = []
+    for k, (kind, share) in enumerate(zip(motions.types, saved, strict=True)):
+        own = has_own_axis(states, motions, k)
+        asked = penalty > 0 and len(motions) > 1 and (own or kind == "revolute")
+        if asked and share is not None and share < (penalty if own else 0.0):
+            out.append(k)
+    return out
+
+
 def drop_untold(
     judge: Judge, motions: PartMotions, labels: Tensor, trust: list[float], least: float
 ) -> tuple[PartMotions, Tensor, list[dict]]:

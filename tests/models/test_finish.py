@@ -26,7 +26,7 @@ from p2gs.motion.joint_confidence import state_depth
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import MovedGaussians, PolishConfig
 from p2gs.ops import se3
-from p2gs.parts.part_choices import better, drop_needless, drop_untold, simplify, without_part
+from p2gs.parts.part_choices import better, drop_needless, drop_untold, needless, simplify, without_part
 from p2gs.types import GaussianTensors, Similarity
 
 
@@ -215,6 +215,18 @@ def test_of_two_turns_about_one_line_one_goes_if_photographs_do_not_need_it(one,
     further = se3.from_screw(screw.axis, screw.origin, 1.1 * float(screw.angle))
     states, _, cut, two = halved("revolute", hinge(), further)
     assert len(drop_needless(Told(states, cut > 0, one, PolishConfig()), two, cut, 0.02)[0]) == left
+
+
+def test_needless_is_what_saves_less_than_its_axis_asks_for():
+    """Of two turns about one line each must save something, of a turn and a slide each its 15 %, of slides along one
+    way nothing, and of the only part nothing is asked."""
+    states, _, _, turns = halved("revolute", hinge(), hinge())
+    assert needless(states, turns, [0.01, -0.01], 0.15) == [1] and needless(states, turns, [0.01, None], 0.15) == []
+    mixed = replace(turns, types=["revolute", "prismatic"], transforms=torch.stack([hinge(), slide()]))
+    assert needless(states, mixed, [0.2, 0.1], 0.15) == [1] and needless(states, mixed, [0.1, 0.1], 0.0) == []
+    slides = replace(turns, types=["prismatic"] * 2, transforms=torch.stack([slide(), slide()]))
+    assert needless(states, slides, [-0.5, -0.5], 0.15) == []
+    assert needless(states, without_part(turns, 1, 1), [-0.5], 0.15) == []
 
 
 def test_the_part_that_photographs_tell_least_of_goes():
