@@ -172,7 +172,7 @@ def _neighbours(
     motions, beside = part_side_by_side(states, surfels, motions, faced, apart, limit, look)
     if beside:
         motions = judge.improved(motions)[2]
-    motions, seamless = join_seamless(judge, motions)
+    motions, seamless = join_seamless(judge, motions, [tuple(split["parts"]) for split in beside])
     motions, fronts = part_fronts(judge, sharpened, surfels, motions, faced, apart, limit)
     return motions, {"side_by_side": beside, "seamless": seamless, "fronts": fronts}
 

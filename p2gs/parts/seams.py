@@ -6,6 +6,7 @@ two, each piece with a motion that its plain surface hardly tells from the other
 from __future__ import annotations
 
 from itertools import combinations
+from typing import Sequence
 
 import numpy as np
 import torch
@@ -22,32 +23,41 @@ from p2gs.visibility.free_space import SURFACE
 VIEWS = 24  # photographs of a state that are looked at
 EDGE = 2  # pixels on either side of a pixel within which an edge counts as there
 FEWEST = 10  # pixels of common border by which a photograph shows two parts beside each other
-MOST = 0.5  # share of such photographs without an edge, in either state, above which surfaces are asked
+MOST = 0.5  # share of such photographs without an edge, in both states, above which surfaces are asked
 EIGHT = np.ones((3, 3), bool)  # neighbours of a pixel
 
 
-def join_seamless(judge: Judge, motions: PartMotions) -> tuple[PartMotions, list[dict]]:
+def join_seamless(
+    judge: Judge, motions: PartMotions, unproven: Sequence[tuple[int, int]] = ()
+) -> tuple[PartMotions, list[dict]]:
     """One part for every two that have a common border in both states and no edge along it (``seamless``), and that
     surfaces do not tell apart: as one, with the motion of either, refined, whichever explains more, their energy is no
-    higher. Returns the motions and what was asked: the two parts, the shares of photographs without an edge, by how
+    higher. Of two that nothing tells apart so far, pairs ``unproven`` with the larger index last, both states must show
+    an edge. Returns the motions and what was asked: the two parts, the shares of photographs without an edge, by how
     much the surfaces' energy is higher as one, and whether they were joined."""
     log: list[dict] = []
-    while (found := _joined(judge, motions, log)) is not None:
-        motions = found
+    while (found := _joined(judge, motions, log, unproven)) is not None:
+        motions, gone = found
+        left = [p for p in unproven if gone not in p]
+        unproven = [(a - (a > gone), b - (b > gone)) for a, b in left]
     return motions, log
 
 
-def _joined(judge: Judge, motions: PartMotions, log: list[dict]) -> PartMotions | None:
-    """The motions with two parts as one, those with fewest edges between them first; None where no two are."""
+def _joined(
+    judge: Judge, motions: PartMotions, log: list[dict], unproven: Sequence[tuple[int, int]]
+) -> tuple[PartMotions, int] | None:
+    """The motions with two parts as one, those with fewest edges between them first, and which part went; None where
+    no two are."""
     shares = seamless(judge, motions) if len(motions) > 1 else {}
-    for a, b in sorted((p for p in shares if min(shares[p]) > MOST), key=lambda p: -min(shares[p])):
+    plain = [p for p, of in shares.items() if min(of) > MOST or (p in unproven and max(of) >= MOST)]
+    for a, b in sorted(plain, key=lambda p: -min(shares[p])):
         one, other = at_once(judge.refine, [without_part(motions, a, b + 1), without_part(motions, b, a + 1)])
-        fewer = one if judge.gain(one, other) > 0 else other
+        fewer, gone = (one, a) if judge.gain(one, other) > 0 else (other, b)
         worse = judge.surfaces(fewer) - judge.surfaces(motions)
         asked = {"parts": [a, b], "without_edge": list(shares[a, b]), "surfaces": worse, "joined": worse <= 0}
         log.append(asked)
         if asked["joined"]:
-            return fewer
+            return fewer, gone
     return None
 
 

@@ -54,11 +54,11 @@ def part_side_by_side(
     look: Look,
 ) -> tuple[PartMotions, list[dict]]:
     """Each slide of which what is behind the front is two trays (``gap_behind``) as two parts with the same motion, up
-    to ``limit`` parts. Whether their fronts are two is for the photographs to say (``join_seamless``).
+    to ``limit`` parts. Whether their fronts are two is for both states' photographs to say (``join_seamless``).
 
     directions [D, 3]: of the object; apart: what surfaces tell apart (internal units); look: which of lines [S, L, 3]
     at the start, carried by a motion [4, 4], were looked through, [L] bool (``bodies.looked_through``). Returns the
-    motions and what was split: part, the gap's width and those of the pieces beside it.
+    motions and what was split: both parts, the gap's width and those of the pieces beside it.
     """
     log: list[dict] = []
     if "prismatic" not in motions.types:
@@ -72,7 +72,7 @@ def part_side_by_side(
         if gap is None:
             part += 1
             continue
-        log.append({"part": part, "gap": gap.size, "widths": list(gap.widths)})
+        log.append({"parts": [part, len(motions)], "gap": gap.size, "widths": list(gap.widths)})
         motions = in_two(states, motions, part, gap.normal, gap.offset)
         surfaces = surfels_of(surfels, states, motions)
     return motions, log

@@ -148,3 +148,22 @@ def test_what_shows_no_edge_stays_two_where_surfaces_tell_it_apart(monkeypatch, 
         assert torch.equal(joined.transforms, turns[:2]) and joined.labels[0].tolist() == [0, 1, 2, 2]
     else:
         assert joined is motions
+
+
+def test_what_was_split_without_a_gain_needs_an_edge_in_both_states(monkeypatch):
+    """Of four slides two pairs are halves of one drawer each, as far as what is behind their fronts says."""
+    shares = {
+        4: {(0, 3): (0.5, 0.4), (1, 2): (0.4, 0.4)},  # the first shows no edge in half of the start's photographs
+        3: {(1, 2): (0.4, 0.6), (0, 1): (0.9, 0.3)},
+        2: {(0, 1): (0.6, 0.3)},
+    }
+    monkeypatch.setattr(seams, "seamless", lambda judge, motions: shares[len(motions)])
+    slides = torch.eye(4).double().repeat(4, 1, 1)
+    slides[:, 0, 3] = torch.tensor([0.1, 0.2, 0.3, 0.1])
+    labels = torch.arange(5)
+    motions = PartMotions(["prismatic"] * 4, slides, torch.ones(4), [labels] * 2, [torch.ones(5)] * 2)
+    judge = Told([], {}, as_one=0.0)
+    assert join_seamless(judge, motions)[0] is motions
+    joined, log = join_seamless(judge, motions, [(0, 3), (1, 2)])
+    assert [x["parts"] for x in log] == [[0, 3], [1, 2]] and all(x["joined"] for x in log)
+    assert joined.labels[0].tolist() == [0, 1, 2, 2, 1] and len(joined) == 2  # the last pair was nobody's half

@@ -62,7 +62,7 @@ def turned() -> torch.Tensor:
 def test_two_trays_behind_one_front_are_two_parts(T, opens):
     states, surfels, motions = drawers([(0.04, 0.44), (0.56, 0.96)], T, opens)
     two, log = part_side_by_side(states, surfels, motions, T[:3, :3].T, APART, 5, seen_through)
-    assert [x["part"] for x in log] == [0] and log[0]["gap"] == pytest.approx(0.14, abs=SPACING)
+    assert [x["parts"] for x in log] == [[0, 1]] and log[0]["gap"] == pytest.approx(0.14, abs=SPACING)
     assert log[0]["widths"] == pytest.approx([0.38, 0.38], abs=SPACING)
     assert two.types == ["prismatic"] * 2 and torch.equal(two.transforms, motions.transforms.repeat(2, 1, 1))
     for s, state in enumerate(states):
