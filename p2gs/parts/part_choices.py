@@ -39,9 +39,9 @@ def simplify(
             done, part, into = change
             if not final and judge.gain(reduced, motions) >= 0:
                 break
-            alone = has_own_axis(states, motions, part) if final else lonely(states, motions, reduced, part)
-            asked = len(motions) > 1 and (alone or (final and motions.types[part] == "revolute"))
-            if done != "merge" and asked and judge.own_share(motions, reduced) < (judge.further if alone else 0.0):
+            alone = len(motions) > 1 and not final and lonely(states, motions, reduced, part)
+            least = must_save(states, motions, part, judge.further) if final else judge.further if alone else None
+            if done != "merge" and least is not None and judge.own_share(motions, reduced) < least:
                 break
         else:
             return motions
@@ -75,13 +75,20 @@ def drop_needless(
 def needless(states, motions: PartMotions, saved: list[float | None], penalty: float) -> list[int]:
     """The parts of several that save less in their own pixels than ``drop_needless`` asks of them. saved: of each, as
     ``own_shares`` has it (None: not asked)."""
-    out = []
-    for k, (kind, share) in enumerate(zip(motions.types, saved, strict=True)):
-        own = has_own_axis(states, motions, k)
-        asked = penalty > 0 and len(motions) > 1 and (own or kind == "revolute")
-        if asked and share is not None and share < (penalty if own else 0.0):
-            out.append(k)
-    return out
+    if penalty <= 0:
+        return []
+    least = [must_save(states, motions, k, penalty) for k in range(len(motions))]
+    asked = enumerate(zip(saved, least, strict=True))
+    return [k for k, (share, of) in asked if share is not None and of is not None and share < of]
+
+
+def must_save(states, motions: PartMotions, part: int, penalty: float) -> float | None:
+    """What a part must save in its own pixels (``Judge.own_share``) now that all motions are known: ``penalty`` if it has
+    an axis of its own, something if it turns about another's, nothing (None) as a slide along another's direction or as
+    the only part."""
+    if len(motions) > 1 and has_own_axis(states, motions, part):
+        return penalty
+    return 0.0 if len(motions) > 1 and motions.types[part] == "revolute" else None
 
 
 def drop_untold(
@@ -110,7 +117,7 @@ def own_shares(judge: Judge, motions: PartMotions) -> list[float]:
 def better(judge: Judge, tried: PartMotions, than: PartMotions) -> bool:
     """Is the energy of ``tried`` lower? One that has more axes than the other must save ``judge.further`` of the image
     loss in its own pixels (``Judge.own_share``) against it as well, or is none the better."""
-    more = axes_used(as_motions(tried.transforms, tried.types)) - axes_used(as_motions(than.transforms, than.types))
+    more = further_axes(tried, than)
     if more < 0:
         return not better(judge, than, tried)
     return judge.gain(tried, than) > 0 and (more == 0 or judge.own_share(tried, than) >= judge.further)
@@ -119,8 +126,12 @@ def better(judge: Judge, tried: PartMotions, than: PartMotions) -> bool:
 def lonely(states, more: PartMotions, fewer: PartMotions, part: int) -> bool:
     """Is there an axis less with ``fewer`` than with ``more``, in which ``part`` is new? Of a row of drawers, or of
     doors on one hinge line, each saves little, and has the axis of the others."""
-    used = [axes_used(as_motions(m.transforms, m.types)) for m in (more, fewer)]
-    return used[0] > used[1] and has_own_axis(states, more, part, coarse=True)
+    return further_axes(more, fewer) > 0 and has_own_axis(states, more, part, coarse=True)
+
+
+def further_axes(more: PartMotions, fewer: PartMotions) -> int:
+    """How many axes ``more`` has above those of ``fewer`` (``axes_used``)."""
+    return axes_used(as_motions(more.transforms, more.types)) - axes_used(as_motions(fewer.transforms, fewer.types))
 
 
 def _reductions(states, motions: PartMotions, same_motion: float, joins: bool = False):
