@@ -24,14 +24,14 @@ from scipy.optimize import minimize
 
 from p2gs.gaussians import handover
 from p2gs.gaussians.handover import PartMotions
-from p2gs.models.finish import FinishRecord, measure
+from p2gs.models.finish_record import FinishRecord, measure
 from p2gs.motion.discovery import instead_of, relabel
 from p2gs.motion.discovery.hypotheses import directions, sweep
 from p2gs.motion.discovery.labels import Graph
 from p2gs.motion.discovery.problem import build_problem
 from p2gs.motion.discovery.search import Search
 from p2gs.motion.joint_confidence import JointEvidence, common_level, features, nudges, state_depth
-from p2gs.motion.refine_motions import Judge, refine, single_ways
+from p2gs.motion.refine_motions import Judge
 from p2gs.motion.relabel import label_gaussians
 from p2gs.ops import se3
 
@@ -90,11 +90,12 @@ def measured(
     explanation = relabel(found, transforms, types)
     labels, margin = label_gaussians(explanation, states)
     motions = PartMotions(types, transforms, torch.zeros(len(types)), labels, margin)
+    judge = Judge(None, states, views, config.polish, stacks, case.cfg.seed, **options)
     if refined:
-        motions = refine(states, motions, views, config.polish, stacks, seed=case.cfg.seed, **options)
+        motions = judge.refine(motions)
     record = FinishRecord(labels, [m.sign() for m in margin], motions.transforms, motions.transforms)
-    record.polish = single_ways(states, motions, views, config.polish, stacks, seed=case.cfg.seed, **options)
-    measure(record, Judge(None, states, views, config.polish, stacks, case.cfg.seed, **options), motions, level)
+    record.polish = judge.single_ways(motions)
+    measure(record, judge, motions, level)
     return judged(case, motions.transforms, types, [e.as_dict() for e in record.evidence])
 
 

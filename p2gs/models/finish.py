@@ -29,7 +29,7 @@ from p2gs.motion.alternatives import other_angles
 from p2gs.motion.directions import shared_axes
 from p2gs.motion.joint_confidence import common_level, state_depth
 from p2gs.motion.joint_range import extend_ranges
-from p2gs.motion.refine_motions import Judge, single_ways
+from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import PolishConfig
 from p2gs.motion.survey import leave_false_minima
 from p2gs.ops import se3
@@ -245,8 +245,7 @@ def _founded(
         motions = keep_axes(judge, motions, axes) if gone else motions
         record.labels, record.after, record.polish, record.evidence = motions.labels, motions.transforms, {}, []
         if len(motions):
-            options: dict[str, Any] = {"seed": judge.seed, "backend": judge.backend, "device": judge.device}
-            record.polish = single_ways(judge.states, motions, judge.views, config.polish, judge.stacks, **options)
+            record.polish = judge.single_ways(motions)
             reach = config.polish.free_moving
             motions, record.fronts = weighed_amounts(judge.states, motions, record.polish, reach)
             record.after = motions.transforms

@@ -9,8 +9,7 @@ from torch import Tensor
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.joint_confidence import JointEvidence, measure_joints
 from p2gs.motion.refine_motions import Judge
-from p2gs.motion.screw_polish import photometric_cost
-from p2gs.ops import se3
+from p2gs.motion.screw_polish import losses_both_ways
 from p2gs.parts.part_choices import own_shares
 
 
@@ -19,7 +18,7 @@ class FinishRecord:
     """What the last stage measured, for the diagnosis.
 
     labels, margin: of the Gaussians of both states (ids as in the twin).  before, after [K-1, 4, 4]: motions around the
-    polish (start -> end, internal units); polish: ``single_ways`` ({} without polish).  costs: image loss of the
+    polish (start -> end, internal units); polish: ``Judge.single_ways`` ({} without polish).  costs: image loss of the
     start's Gaussians in the end's photographs and the reverse, as {"before": [2], "after": [2]}.  evidence: per joint.
     together: image loss with screws held and free (``fit_together``; {}: not tried).
     laid: axes that were tried along the object's directions (``lay_axes``).  fronts: of slides, what their fronts said
@@ -48,11 +47,7 @@ def measure(record: FinishRecord, judge: Judge, motions: PartMotions, level: int
     states, views = judge.states, judge.views
     options = {"level": level, "backend": judge.backend, "device": judge.device}
     for name, T in (("before", record.before), ("after", record.after)):
-        ways = (T, se3.inverse(T))
-        record.costs[name] = [
-            photometric_cost(states[s].gaussians, record.labels[s], ways[s], views[1 - s], count=8, **options)
-            for s in (0, 1)
-        ]
+        record.costs[name] = losses_both_ways(states, record.labels, T, views, count=8, **options)
     both = [record.polish[w] for w in ("forward", "backward")] if "backward" in record.polish else None
     known = [m >= 0 for m in record.margin]
     shown = [replace(s, gaussians=s.gaussians[k]) for s, k in zip(states, known, strict=True)]

@@ -11,7 +11,7 @@ from torch import Tensor
 from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.joint_confidence import common_level
 from p2gs.motion.refine_motions import Judge
-from p2gs.motion.screw_polish import photometric_cost
+from p2gs.motion.screw_polish import losses_both_ways
 from p2gs.native import at_once
 from p2gs.ops import se3
 
@@ -42,10 +42,8 @@ def _of(judge: Judge, motions: PartMotions, told: float, k: int) -> list[Tensor]
         return motions.with_motion(k, "revolute", se3.from_screw(screw.axis, screw.origin, screw.angle + further))
 
     def loss(further: float, level: int) -> float:
-        tried, options = turned(further), {"level": level, "backend": judge.backend, "device": judge.device}
-        ways = tried.transforms, se3.inverse(tried.transforms)
-        sides = zip(judge.states, tried.labels, ways, (judge.views[1], judge.views[0]), strict=True)
-        return sum(photometric_cost(s.gaussians, of, T, views, **options) for s, of, T, views in sides)
+        options = {"level": level, "backend": judge.backend, "device": judge.device}
+        return sum(losses_both_ways(judge.states, motions.labels, turned(further).transforms, judge.views, **options))
 
     step, small, large = 2 * math.pi / LOOKS, min(judge.views[0].levels), common_level(judge.views)
     losses = [loss(i * step, small) for i in range(LOOKS)]

@@ -36,78 +36,6 @@ def polish_labels(motions: PartMotions, state: int, min_margin: float) -> Tensor
     return torch.where(motions.margin[state] >= min_margin, motions.labels[state], -1)
 
 
-def sides_of(
-    states,
-    motions: PartMotions,
-    views,
-    config: PolishConfig,
-    stacks: list[DepthStack],
-    *,
-    backend: str,
-    seen: list[Seen] | None = None,
-    device="cpu",
-) -> list[Side]:
-    """Both directions: the start's Gaussians against the end's photographs, and the reverse, of each what both states
-    show.
-
-    stacks: rendered depth of both states.  seen: of ``what_counts`` for these motions (None: found).
-    """
-    seen = what_counts(states, motions, config, stacks, backend=backend, device=device) if seen is None else seen
-    sides = []
-    for s in (0, 1):
-        labels = torch.where(seen[s].kept, polish_labels(motions, s, config.min_margin), -1)
-        ways = seen_from(states[s].gaussians, stacks[s], config.free_static or 0.02) if config.front > -1 else None
-        sides.append(Side(seen[s].lit, labels, views[1 - s], s == 1, ways, seen[1 - s].pixels))
-    return sides
-
-
-def refine(
-    states,
-    motions: PartMotions,
-    views,
-    config: PolishConfig,
-    stacks: list[DepthStack],
-    *,
-    seed: int,
-    backend: str,
-    axes: Tensor | None = None,
-    seen: list[Seen] | None = None,
-    device="cpu",
-) -> PartMotions:
-    """Photometric refinement of all motions, both directions at once. axes: as in ``polish``.  seen: as in
-    ``sides_of``."""
-    if config.steps <= 0 or len(motions) == 0:
-        return motions
-    sides = sides_of(states, motions, views, config, stacks, seen=seen, backend=backend, device=device)
-    options = {"seed": seed, "axes": axes, "backend": backend, "device": device}
-    result, _ = polish(sides, motions.transforms, motions.types, config, **options)
-    return replace(motions, transforms=result)
-
-
-def single_ways(
-    states,
-    motions: PartMotions,
-    views,
-    config: PolishConfig,
-    stacks: list[DepthStack],
-    *,
-    seed: int,
-    backend: str,
-    device="cpu",
-) -> dict:
-    """Where each direction alone takes refined motions: {"forward", "backward"} [K-1, 4, 4], both start -> end.
-
-    A third of the polish's steps at half its rate. How far the two come apart tells how sure the photographs are.
-    """
-    if config.steps <= 0 or len(motions) == 0:
-        return {}
-    short = replace(config, steps=max(config.steps // 3, 1), rate=config.rate / 2)
-    sides = sides_of(states, motions, views, config, stacks, backend=backend, device=device)
-    options = {"seed": seed, "backend": backend, "device": device}
-    found = at_once(lambda side: polish([side], motions.transforms, motions.types, short, **options), sides)
-    return {name: T for name, (T, _) in zip(("forward", "backward"), found, strict=True)}
-
-
 def explanation_cost(
     states,
     motions: PartMotions,
@@ -254,12 +182,38 @@ class Judge:
         cost = self.cost(motions)
         return math.log(max(cost, 1e-9)) + self.surfaces(motions), cost
 
+    def sides(self, motions: PartMotions) -> list[Side]:
+        """Both directions: the start's Gaussians against the end's photographs, and the reverse, of each what both
+        states show."""
+        seen, config, sides = self.seen(motions), self.config, []
+        for s, (state, stack) in enumerate(zip(self.states, self.stacks, strict=True)):
+            labels = torch.where(seen[s].kept, polish_labels(motions, s, config.min_margin), -1)
+            ways = seen_from(state.gaussians, stack, config.free_static or 0.02) if config.front > -1 else None
+            sides.append(Side(seen[s].lit, labels, self.views[1 - s], s == 1, ways, seen[1 - s].pixels))
+        return sides
+
     def refine(self, motions: PartMotions, axes: Tensor | None = None) -> PartMotions:
-        """Refined by the photographs, whether or not the energy falls. axes: as in ``polish``."""
+        """Refined by the photographs, both directions at once, whether or not the energy falls. axes: as in
+        ``polish``."""
         if self.config.steps <= 0 or len(motions) == 0:
             return motions
         options = {"seed": self.seed, "axes": axes, "backend": self.backend, "device": self.device}
-        return refine(self.states, motions, self.views, self.config, self.stacks, seen=self.seen(motions), **options)
+        result, _ = polish(self.sides(motions), motions.transforms, motions.types, self.config, **options)
+        return replace(motions, transforms=result)
+
+    def single_ways(self, motions: PartMotions) -> dict:
+        """Where each direction alone takes refined motions: {"forward", "backward"} [K-1, 4, 4], both start -> end.
+
+        A third of the polish's steps at half its rate. How far the two come apart tells how sure the photographs are.
+        """
+        config = self.config
+        if config.steps <= 0 or len(motions) == 0:
+            return {}
+        short = replace(config, steps=max(config.steps // 3, 1), rate=config.rate / 2)
+        options = {"seed": self.seed, "backend": self.backend, "device": self.device}
+        one_way = partial(polish, transforms=motions.transforms, types=motions.types, config=short, **options)
+        found = at_once(lambda side: one_way([side]), self.sides(motions))
+        return {name: T for name, (T, _) in zip(("forward", "backward"), found, strict=True)}
 
     def improved(self, motions: PartMotions) -> tuple[float, float, PartMotions]:
         """Energy, image loss and motions: refined where that gains, else as they were. Where a part is plain,

@@ -7,7 +7,7 @@ same images give the motion to a few hundredths of a degree.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Callable
+from typing import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -203,6 +203,15 @@ def anchors_of(sides, bodies, transforms: Tensor) -> tuple[Tensor, Tensor]:
         anchors.append(torch.stack(centres).mean(0) if centres else torch.zeros(3, dtype=torch.float64))
         radius.append(max(sum(spreads) / max(len(spreads), 1), 1e-3))
     return torch.stack(anchors), torch.tensor(radius, dtype=torch.float64)
+
+
+def losses_both_ways(
+    states, labels: Sequence[Tensor], transforms: Tensor, views: dict[int, TrainingViews], **options
+) -> list[float]:
+    """``photometric_cost`` of the start's Gaussians in the end's photographs and of the end's in the start's. labels:
+    [N] by state; transforms [K-1, 4, 4] start -> end."""
+    ways = transforms, se3.inverse(transforms)
+    return [photometric_cost(states[s].gaussians, labels[s], ways[s], views[1 - s], **options) for s in (0, 1)]
 
 
 @torch.no_grad()

@@ -6,6 +6,7 @@
 
 #include "kernels.h"
 #include "pool.h"
+#include "quaternion.h"
 
 namespace p2gs {
 namespace {
@@ -29,29 +30,13 @@ void basis(int band, const double* d, double* out) {
     }
 }
 
-// Unit quaternion wxyz, w >= 0: of 4 q q^T, which R gives linearly, the row of the largest component.
-void quaternion(const double R[3][3], float* out) {
-    const double wx = R[2][1] - R[1][2], wy = R[0][2] - R[2][0], wz = R[1][0] - R[0][1];
-    const double xy = R[0][1] + R[1][0], xz = R[0][2] + R[2][0], yz = R[1][2] + R[2][1];
-    const double outer[4][4] = {{1 + R[0][0] + R[1][1] + R[2][2], wx, wy, wz},
-                                {wx, 1 + R[0][0] - R[1][1] - R[2][2], xy, xz},
-                                {wy, xy, 1 - R[0][0] + R[1][1] - R[2][2], yz},
-                                {wz, xz, yz, 1 - R[0][0] - R[1][1] + R[2][2]}};
-    int best = 0;
-    double length = 0;
-    for (int i = 1; i < 4; ++i)
-        if (outer[i][i] > outer[best][best]) best = i;
-    for (double v : outer[best]) length += v * v;
-    length = std::sqrt(length) * (outer[best][0] < 0 ? -1 : 1);
-    for (int i = 0; i < 4; ++i) out[i] = float(outer[best][i] / length);
-}
-
 CarryMotion motion(const float* T, int bases, const double* tables) {
     CarryMotion m = {};
-    double R[3][3];
+    double R[3][3], q[4];
     for (int i = 0; i < 12; ++i) m.rigid[i] = T[i];
     for (int i = 0; i < 9; ++i) R[i / 3][i % 3] = T[4 * (i / 3) + i % 3];
-    quaternion(R, m.quat);
+    quaternion(R, q);
+    std::copy(q, q + 4, m.quat);
     float* out = m.bands;
     for (int band = 1; band * band < bases; ++band) {
         const int side = 2 * band + 1, count = 4 * band + 8;

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "quaternion.h"
+
 namespace p2gs {
 namespace {
 
@@ -22,24 +24,14 @@ struct Step {
     Vec turn, shift;
 };
 
-// The rotation vector of T's rotation, of length in 0..pi, by its quaternion: the row of 4 q q^T with the largest diagonal.
+// The rotation vector of T's rotation, of length in 0..pi.
 Vec rotation_vector(const double* T) {
-    const double r[3][3] = {{T[0], T[1], T[2]}, {T[4], T[5], T[6]}, {T[8], T[9], T[10]}};
-    const double wx = r[2][1] - r[1][2], wy = r[0][2] - r[2][0], wz = r[1][0] - r[0][1];
-    const double xy = r[0][1] + r[1][0], xz = r[0][2] + r[2][0], yz = r[1][2] + r[2][1];
-    const double outer[4][4] = {{1 + r[0][0] + r[1][1] + r[2][2], wx, wy, wz},
-                                {wx, 1 + r[0][0] - r[1][1] - r[2][2], xy, xz},
-                                {wy, xy, 1 - r[0][0] + r[1][1] - r[2][2], yz},
-                                {wz, xz, yz, 1 - r[0][0] - r[1][1] + r[2][2]}};
-    int best = 0;
-    for (int i = 1; i < 4; ++i)
-        if (outer[i][i] > outer[best][best]) best = i;
-    const double* q = outer[best];
-    const double length = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) * (q[0] < 0 ? -1 : 1);
-    const double w = q[0] / length;
-    const Vec v = (1 / length) * Vec{q[1], q[2], q[3]};
+    const double R[3][3] = {{T[0], T[1], T[2]}, {T[4], T[5], T[6]}, {T[8], T[9], T[10]}};
+    double q[4];
+    quaternion(R, q);
+    const Vec v = {q[1], q[2], q[3]};
     const double s = std::sqrt(dot(v, v));
-    return (s > 1e-12 ? 2 * std::atan2(s, w) / s : 2 / w) * v;
+    return (s > 1e-12 ? 2 * std::atan2(s, q[0]) / s : 2 / q[0]) * v;
 }
 
 // Rodrigues.

@@ -83,9 +83,9 @@ def needless(states, motions: PartMotions, saved: list[float | None], penalty: f
 
 
 def must_save(states, motions: PartMotions, part: int, penalty: float) -> float | None:
-    """What a part must save in its own pixels (``Judge.own_share``) now that all motions are known: ``penalty`` if it has
-    an axis of its own, something if it turns about another's, nothing (None) as a slide along another's direction or as
-    the only part."""
+    """What a part must save in its own pixels (``Judge.own_share``) once all motions are known: ``penalty`` if it has
+    an axis of its own, something if it turns about another's, nothing (None) as a slide along another's direction or
+    as the only part."""
     if len(motions) > 1 and has_own_axis(states, motions, part):
         return penalty
     return 0.0 if len(motions) > 1 and motions.types[part] == "revolute" else None
