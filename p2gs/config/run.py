@@ -12,6 +12,7 @@ import functools
 import importlib
 import os
 import pkgutil
+import sys
 from pathlib import Path
 from typing import Any, Iterable, Optional
 
@@ -19,7 +20,7 @@ from p2gs.callbacks.base import CALLBACKS, Callback
 from p2gs.config.class_path import plain_sections, with_class_paths
 from p2gs.config.files import Layer, overrides_layer, parse_overrides, read_config, to_yaml
 from p2gs.config.keys import Options, data_class, run_keys
-from p2gs.config.schema import Given, Plain, check_keys, merge
+from p2gs.config.schema import Given, Keys, Plain, check_keys, known_part, merge
 from p2gs.config.trainer import check_trainer_options
 from p2gs.data.base import DATASETS, TwoStateData
 from p2gs.data.layouts import format_of
@@ -178,13 +179,31 @@ def config_of(layers: list[Layer], plugins: Iterable[str] = ()) -> RunConfig:
     last = format_of(Path(root)) if formats[-1] is None and isinstance(root, str) else formats[-1]
     keys, merged = run_keys(last), {}
     for layer, name in zip(layers, formats[1:], strict=True):
-        check_keys(layer.tree, keys if name in (None, last) else run_keys(name), layer.where)
-        merged = merge(merged, layer.tree)
+        tree = checked(layer, keys if name in (None, last) else run_keys(name))
+        merged = merge(merged, tree)
     merged.pop("p2gs", None)
     merged["plugins"] = list(dict.fromkeys(names))
     if merged.get("data"):  # another format came later: keep what it knows too
         merged["data"] = {k: v for k, v in merged["data"].items() if k in keys["data"]}
     return RunConfig(merged, last)
+
+
+def checked(layer: Layer, keys: Keys) -> Plain:
+    """The layer's tree, its keys checked. One that ``save_config`` wrote may be another version's: options that are no
+    more are left out, with a note, so that finished runs stay readable. Raises UserError for any other wrong key."""
+    tree = layer.tree
+    if "p2gs" in tree:
+        tree, gone = known_part(tree, keys)
+        if gone:
+            _tell_left_out(layer.where, tuple(gone))
+    check_keys(tree, keys, layer.where)
+    return tree
+
+
+@functools.lru_cache
+def _tell_left_out(where: str, gone: tuple[str, ...]) -> None:
+    """Once a process, though a config is read more than once."""
+    print(f"note: {where}left out, as this version has no such option: {', '.join(gone)}", file=sys.stderr, flush=True)
 
 
 def import_builtins() -> None:

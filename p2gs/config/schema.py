@@ -128,6 +128,19 @@ def check_keys(tree: Plain, keys: Keys, where: str = "") -> None:
     check(tree, keys, "")
 
 
+def known_part(tree: Plain, keys: Keys, path: str = "") -> tuple[Plain, list[str]]:
+    """The tree without keys that do not exist, and these, dotted."""
+    kept, gone = {}, [path + name for name in tree if name not in keys]
+    for name, value in tree.items():
+        inner = keys.get(name)
+        if inner is not None and isinstance(value, dict):
+            kept[name], more = known_part(value, inner, f"{path}{name}.")
+            gone += more
+        elif name in keys:
+            kept[name] = value
+    return kept, gone
+
+
 def walk(keys: Keys, prefix: str = "") -> Iterator[str]:
     """Every dotted key, sections included."""
     for name, inner in keys.items():
