@@ -201,11 +201,15 @@ def write_rows(
     """A line of JSON per run, printed as ``told`` says and, where asked for, written."""
     torch.set_num_threads(args.threads)
     for run in args.runs:
-        row = row_of(Case(run, args.zoo))
-        print(told(row), flush=True)
-        if args.out:
-            with args.out.open("a") as f:
-                f.write(json.dumps(row) + "\n")
+        write_row(row_of(Case(run, args.zoo)), args.out, told)
+
+
+def write_row(row: dict, out: Path | None, told: Callable[[dict], str] = json.dumps) -> None:
+    """The row printed as ``told`` says and, as a line of JSON, added to the file ``out``, if any."""
+    print(told(row), flush=True)
+    if out:
+        with out.open("a") as f:
+            f.write(json.dumps(row) + "\n")
 
 
 def rungs(case: Case) -> dict:

@@ -17,7 +17,7 @@ from typing import Any, Callable, Iterator
 from unittest import mock
 
 import torch
-from ladder import RIGHT, Case, runs_parser
+from ladder import RIGHT, Case, runs_parser, write_row
 
 import p2gs.models.part_discovery as stage
 import p2gs.motion.discovery.explanations as explanations
@@ -173,10 +173,7 @@ def main() -> None:
         known = [json.loads(line) for line in args.out.read_text("utf-8").splitlines()]
     for run in args.runs:
         for row in rows_of(partial(Case, run, args.zoo), run.name, args.steps, known):
-            print(json.dumps(row), flush=True)
-            if args.out:
-                with args.out.open("a") as f:
-                    f.write(json.dumps(row) + "\n")
+            write_row(row, args.out)
 
 
 if __name__ == "__main__":

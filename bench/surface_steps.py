@@ -10,13 +10,13 @@ parts' mean and the whole, and triangles, with everything ("all") and without ea
 from __future__ import annotations
 
 import argparse
-import json
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Iterator
 from unittest import mock
 
 import torch
+from ladder import write_row
 
 import p2gs.surface.mesh as meshing
 import p2gs.surface.sightings as sightings
@@ -111,11 +111,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     for run in options.runs:
-        row = steps(run)
-        print(json.dumps(row), flush=True)
-        if options.out:
-            with options.out.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+        write_row(steps(run), options.out)
 
 
 if __name__ == "__main__":
