@@ -82,7 +82,7 @@ def displaced(case: Case, own: PartMotions, sizes=(0.02, 0.06)) -> list[tuple[to
 
 
 def measured(
-    case: Case, found, states, stacks, level: int, transforms: torch.Tensor, types: list[str], refined: bool
+    case: Case, found, states, stacks, transforms: torch.Tensor, types: list[str], refined: bool
 ) -> list[dict]:
     """Each joint's measures, after the last stage's refinement if ``refined``, and whether it is right."""
     config, views = case.cfg.phases["finish"].config, case.pipeline.views
@@ -95,7 +95,7 @@ def measured(
         motions = judge.refine(motions)
     record = FinishRecord(labels, [m.sign() for m in margin], motions.transforms, motions.transforms)
     record.polish = judge.single_ways(motions)
-    measure(record, judge, motions, level)
+    measure(record, judge, motions)
     return judged(case, motions.transforms, types, [e.as_dict() for e in record.evidence])
 
 
@@ -130,7 +130,7 @@ def gather(run: Path, zoo: Path, sets: int, out: Path) -> None:
     rows = own_joints(case, run)
     for refined, proposals in ((True, considered(found, own, sets)), (False, displaced(case, own))):
         for T, types in proposals:
-            rows += measured(case, found, states, stacks, level, T, types, refined)
+            rows += measured(case, found, states, stacks, T, types, refined)
     with out.open("a") as f:
         f.writelines(json.dumps({"name": case.name, **row}) + "\n" for row in rows)
 

@@ -4,7 +4,7 @@
 
 RUN holds the single states of a scene (``p2gs fit ... --only registration``). Discovery is run from them with all
 steps, and once more without each step that changed something then (a step that did not is worth nothing on that
-object) or, of a term, without it. A line of JSON per run goes to FILE; what it holds already is not run again.
+object). A line of JSON per run goes to FILE; what it holds already is not run again.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class Step:
     """A function that can be left out.
 
     where, name: the modules that call it and its name there.  without: what is called instead.  changed: of what it
-    returned and its arguments, whether it did anything (None: it is a term and always does).  when: of its arguments,
-    whether this call is one of the step's (the others stay).
+    returned and its arguments, whether it did anything.  when: of its arguments, whether this call is one of the step's
+    (the others stay).
     """
 
     where: tuple
     name: str
     without: Callable
-    changed: Callable[[Any, tuple], bool] | None
+    changed: Callable[[Any, tuple], bool]
     when: Callable[[tuple], bool] = lambda arguments: True
 
 
@@ -101,7 +101,7 @@ def watched() -> Iterator[set[str]]:
 
     def watch(name: str, step: Step, real: Callable, *arguments, **options):
         out = real(*arguments, **options)
-        if step.when(arguments) and (step.changed is None or step.changed(out, arguments)):
+        if step.when(arguments) and step.changed(out, arguments):
             acted.add(name)
         return out
 

@@ -148,7 +148,7 @@ def finish(
         judge = Judge(None, states, views, config.polish, stacks, **options)
         motions = PartMotions(types, transforms, learned.confidence[keep], record.labels, record.margin)
         refined, axes, record.laid = _refined(judge, motions, axes, config)
-        refined, labels, left = _needed(record, judge, refined, learned, labels, axes, config, level)
+        refined, labels, left = _needed(record, judge, refined, learned, labels, axes, config)
         notes += [f"slot {k} of {len(learned.types)} {why}" for k, why in left]
         types, transforms = refined.types, refined.transforms
         record.others = other_angles(judge, refined, config.part_penalty)
@@ -206,7 +206,6 @@ def _needed(
     labels: Tensor,
     axes: Tensor,
     config: FinishConfig,
-    level: int,
 ) -> tuple[PartMotions, Tensor, list[tuple[int, str]]]:
     """The motions of the parts that are worth being ones (``_founded``), fitted together with the Gaussians
     (``_with_gaussians``), again without those that then save less than they must; the twin's labels [N], and slot and
@@ -214,9 +213,9 @@ def _needed(
     left: list[tuple[int, str]] = []
     for number in count():
         before = len(motions)
-        motions, labels, axes, gone = _founded(record, judge, motions, labels, axes, config, level)
+        motions, labels, axes, gone = _founded(record, judge, motions, labels, axes, config)
         left += gone
-        motions = _with_gaussians(record, judge, motions, learned, labels, axes, config, level)
+        motions = _with_gaussians(record, judge, motions, learned, labels, axes, config)
         saved = [e.saved for e in record.evidence]
         if not needless(judge.states, motions, saved, config.part_penalty) or (number and len(motions) == before):
             break
@@ -230,7 +229,6 @@ def _founded(
     labels: Tensor,
     axes: Tensor,
     config: FinishConfig,
-    level: int,
 ) -> tuple[PartMotions, Tensor, Tensor, list[tuple[int, str]]]:
     """The parts that are worth being ones and whose motion photographs tell: their motions, the twin's labels [N], the
     directions that they keep, slot and reason of each that vanished; ``record`` says what was measured of them. axes
@@ -249,7 +247,7 @@ def _founded(
             reach = config.polish.free_moving
             motions, record.fronts = weighed_amounts(judge.states, motions, record.polish, reach)
             record.after = motions.transforms
-            measure(record, judge, motions, level)
+            measure(record, judge, motions)
         trust = [e.confidence for e in record.evidence]
         motions, labels, gone = drop_untold(judge, motions, labels, trust, config.min_confidence)
         if not gone:
@@ -264,7 +262,6 @@ def _with_gaussians(
     labels: Tensor,
     axes: Tensor,
     config: FinishConfig,
-    level: int,
 ) -> PartMotions:
     """The motions as photographs have them when Gaussians bend with them (``fit_together``); slides of a row keep their
     direction, and joints one along the object's that they were laid on. labels [N]: the twin's; axes [K, 3]."""
@@ -277,7 +274,7 @@ def _with_gaussians(
     fitted, record.together = fit_together(g, labels, motions, time, judge.views, config.together, lambda_, **options)
     if fitted is not motions:
         record.after = fitted.transforms
-        measure(record, judge, fitted, level)
+        measure(record, judge, fitted)
     return fitted
 
 

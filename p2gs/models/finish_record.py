@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from torch import Tensor
 
 from p2gs.gaussians.handover import PartMotions
-from p2gs.motion.joint_confidence import JointEvidence, measure_joints
+from p2gs.motion.joint_confidence import JointEvidence, common_level, measure_joints
 from p2gs.motion.refine_motions import Judge
 from p2gs.motion.screw_polish import losses_both_ways
 from p2gs.parts.part_choices import own_shares
@@ -42,10 +42,10 @@ class FinishRecord:
     together: dict[str, float] = field(default_factory=dict)
 
 
-def measure(record: FinishRecord, judge: Judge, motions: PartMotions, level: int) -> None:
-    """Fill in ``costs`` and ``evidence`` of the final motions. level: image size."""
+def measure(record: FinishRecord, judge: Judge, motions: PartMotions) -> None:
+    """Fill in ``costs`` and ``evidence`` of the final motions, at the states' ``common_level``."""
     states, views = judge.states, judge.views
-    options = {"level": level, "backend": judge.backend, "device": judge.device}
+    options = {"level": common_level(views), "backend": judge.backend, "device": judge.device}
     for name, T in (("before", record.before), ("after", record.after)):
         record.costs[name] = losses_both_ways(states, record.labels, T, views, count=8, **options)
     both = [record.polish[w] for w in ("forward", "backward")] if "backward" in record.polish else None
