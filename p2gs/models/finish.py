@@ -37,6 +37,7 @@ from p2gs.parts.askew import keep_axes, lay_axes, on_axes
 from p2gs.parts.fronts import weighed_amounts
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import drop_needless, drop_untold, needless, settle_types
+from p2gs.surface.closed import FACES
 from p2gs.types import ArticulatedObject, GaussianTensors, Part, Similarity
 
 EMPTY = "vanished: no Gaussians of its own, or no motion"
@@ -64,8 +65,8 @@ class FinishConfig:
     them later). extend_range: joint limits go on beyond the observed motion until the part touches another one (half a
     turn, the object's diagonal at most); off: they are the observed motion. unclear: Gaussians whose majority exceeds
     the rest by less are shown as such in the diagnosis (0..1). complete: meshes have guesses for what no camera saw
-    (undersides, drawers' trays, hidden middles). closed: they are watertight, by a cut; a sheet that hangs in an
-    opening gets two sides (CD static of five objects 1.23 open, 1.38 closed). whole: the mesh of the whole is its parts
+    (undersides, drawers' trays, hidden middles). closed: they are watertight, by a cut. max_faces: triangles of a
+    part's closed mesh, as far as half a voxel of error allows. whole: the mesh of the whole is its parts
     "joined", or a surface of its own, made "separate"ly from each state's views, as PARIS, DTA and ArtGS have it.
     cluster: for meshes a moving part keeps only its largest DBSCAN cluster of Gaussians, this the radius (input units;
     0 = off; ArtGS cleans real scans so, with 0.05).
@@ -89,7 +90,8 @@ class FinishConfig:
     extend_range: bool = False
     unclear: float = 0.8
     complete: bool = True
-    closed: bool = False
+    closed: bool = True
+    max_faces: int = FACES
     whole: Literal["joined", "separate"] = "joined"
     cluster: float = 0.0
 

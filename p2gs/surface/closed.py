@@ -18,22 +18,26 @@ import torch
 from torch import Tensor
 
 from p2gs.ops.knn import search_tree
-from p2gs.ops.mesh import Mesh
+from p2gs.ops.mesh import Mesh, components
 from p2gs.surface.depth_view import DepthView, pixel_matrix, seen_points
 from p2gs.surface.integrate import integrate
+from p2gs.surface.simplify import simplify
 from p2gs.surface.tsdf import ActiveGrid
 
-TRUNCATION, BEHIND = (
-    4.0,
-    1.5,
-)  # voxels before and behind a surface within which it counts (tsdf.fuse: the walls are thin)
+# voxels before and behind a surface within which it counts (tsdf.fuse: the walls are thin)
+TRUNCATION, BEHIND = 4.0, 1.5
 ENOUGH = 0.3  # weight of views at which their vote is worth half of many views' (FREE_WEIGHT: of one that sees through)
 HOLLOW = 0.3  # votes for free of a cell that nobody saw
 FACE = 0.05  # votes that a voxel's face costs: a plate with less to say for it than for two of its faces goes
 BESIDE = 1.5  # voxels from a surface within which a point is on it
 PIECE = 0.1  # share of the largest piece's cells below which a piece goes
-LEAST = 0.05  # by which a cell of the solid is within it, of TRUNCATION: no corner of a triangle lies on a cell
-SHIFT = 0.2  # voxels by which simplifying may move a surface: a plate of one cell is half a voxel thick
+# of TRUNCATION: how near to a cell's middle the surface may pass (no corner of a triangle lies on a cell), and by how
+# much at most a cell that the cut has otherwise than its distance says is on the other side
+CLEAR, OTHERWISE = 0.005, 0.05
+# voxels: greatest quadric error (a sum over planes) of an edge that simplifying collapses; all but a thousandth of
+# storage4's and fridge2's surfaces stay within half a voxel
+ERROR = 2.0
+FACES = 20_000  # triangles of a part, where ERROR allows
 
 
 @dataclass
@@ -78,9 +82,17 @@ class Cells:
         return np.where((self.weight == 0) | ((votes > 0) & ~beside), -HOLLOW, votes)
 
 
-def close(seen: Mesh, done: Mesh, views: Sequence[DepthView], poses: Sequence[Tensor], part: int, voxel: float) -> Mesh:
-    """The closed surface of a part: watertight, without self-contact, facing outwards, with ``guessed`` faces where
-    nobody saw a surface; simplified (``SHIFT``). Empty where there is none.
+def close(
+    seen: Mesh,
+    done: Mesh,
+    views: Sequence[DepthView],
+    poses: Sequence[Tensor],
+    part: int,
+    voxel: float,
+    max_faces: int = FACES,
+) -> Mesh:
+    """The closed surface of a part: watertight, facing outwards, with ``guessed`` faces where nobody saw a surface;
+    simplified to ``max_faces`` as far as ``ERROR`` allows. Empty where there is none.
 
     seen: its surface as seen (``tsdf.fuse``).  done: the same, with guesses for unseen places, without what cannot be
     there.  views, poses, part, voxel: as in ``tsdf.fuse``.
@@ -96,7 +108,7 @@ def close(seen: Mesh, done: Mesh, views: Sequence[DepthView], poses: Sequence[Te
     solid = _solid(cells, beside, guess, before & ~_within(after, BESIDE))
     if not solid.any():
         return Mesh.empty()
-    mesh = simplified(_boundary(cells, solid, guess), SHIFT * voxel)
+    mesh = without_scraps(simplified(boundary(cells, solid, guess), ERROR * voxel, max_faces), voxel**3)
     colours = done.colours[search_tree(done.vertices).query(mesh.vertices)[1]]
     return replace(mesh, colours=colours, guessed=_unseen(mesh, cells))
 
@@ -152,30 +164,40 @@ def _pieces(cells: np.ndarray) -> np.ndarray:
     return found[0].astype(np.int64)
 
 
-def _boundary(cells: Cells, solid: np.ndarray, guess: np.ndarray) -> Mesh:
+def boundary(cells: Cells, solid: np.ndarray, guess: np.ndarray) -> Mesh:
     """The solid's surface: where the signed distance is zero, and half way between cells where nobody measured it."""
     from scipy.ndimage import gaussian_filter
     from skimage.measure import marching_cubes
 
     smooth = gaussian_filter(np.where(solid, -1.0, 1.0).astype(np.float32), 1.0) / TRUNCATION
     field = np.where((cells.sighted > 0) & ~guess, cells.field, smooth)
-    field = np.where(solid, np.minimum(field, -LEAST), np.maximum(field, LEAST))
+    distance = np.abs(field).clip(CLEAR, np.where((field < 0) == solid, 1.0, OTHERWISE))
+    field = np.where(solid, -distance, distance)
     vertices, faces, _, _ = marching_cubes(field.astype(np.float32), 0.0, gradient_direction="descent")
     return Mesh(cells.origin + vertices.astype(np.float64) * cells.voxel, faces.astype(np.int64))
 
 
-def simplified(mesh: Mesh, error: float) -> Mesh:
-    """A closed mesh with as few triangles as keep its surface within ``error``, black. Raises ValueError for one that
-    is not closed."""
+def simplified(mesh: Mesh, error: float, max_faces: int) -> Mesh:
+    """A closed mesh, black, with at most about ``max_faces`` triangles, or as many as keep its surface within
+    ``error``. Raises ValueError for one that has a hole (but for what simplifying shuts)."""
     import manifold3d
 
     middle = mesh.vertices.mean(0)  # manifold3d has float32
-    shape = manifold3d.Mesh((mesh.vertices - middle).astype(np.float32), mesh.faces.astype(np.uint32))
-    solid = manifold3d.Manifold(shape)
+    fewer = simplify(mesh, max_faces, error)
+    shape = manifold3d.Mesh((fewer.vertices - middle).astype(np.float32), fewer.faces.astype(np.uint32))
+    solid = manifold3d.Manifold(shape)  # where collapses made surfaces touch, they are taken apart
     if solid.status() != manifold3d.Error.NoError:
         raise ValueError(f"a mesh that is not closed cannot be simplified ({solid.status()})")
-    out = solid.simplify(error).to_mesh()
+    out = solid.to_mesh()
     return Mesh(out.vert_properties[:, :3].astype(np.float64) + middle, out.tri_verts.astype(np.int64))
+
+
+def without_scraps(mesh: Mesh, volume: float) -> Mesh:
+    """A closed mesh without its pieces that enclose less than ``volume``: what collapses pinched off."""
+    piece = components(mesh)
+    a, b, c = ((mesh.vertices - mesh.vertices.mean(0))[mesh.faces[:, i]] for i in range(3))
+    enclosed = np.bincount(piece, (a * np.cross(b, c)).sum(1)) / 6  # negative for a void
+    return mesh.only((np.abs(enclosed) >= volume)[piece])
 
 
 def _unseen(mesh: Mesh, cells: Cells) -> np.ndarray:

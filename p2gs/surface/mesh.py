@@ -16,7 +16,7 @@ from p2gs.gaussians.views import NamedCamera, orbit, read_cameras
 from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh
 from p2gs.surface.bridges import bridged
-from p2gs.surface.closed import close
+from p2gs.surface.closed import FACES, close
 from p2gs.surface.pieces import join_pieces
 from p2gs.surface.protocol import largest_clusters, separate_whole, surface_options
 from p2gs.surface.sightings import RESOLUTION, TRUNCATION, Sightings, sight, start_motion
@@ -48,7 +48,8 @@ def part_meshes(
     cameras: Sequence[tuple[int, Camera]],
     resolution: int = RESOLUTION,
     complete: bool = True,
-    closed: bool = False,
+    closed: bool = True,
+    max_faces: int = FACES,
 ) -> list[Mesh]:
     """The parts' surfaces in the start state, in the order of ``obj.parts``, an empty mesh where no view shows a part.
 
@@ -56,7 +57,8 @@ def part_meshes(
 
     obj and cameras ((state, camera) pairs) in one coordinate system. resolution: voxels along the longest side of the
     object.
-    complete: off, there is only what was seen, and the meshes are open.  closed: watertight (``closed.close``).
+    complete: off, there is only what was seen, and the meshes are open.  closed: watertight, with about ``max_faces``
+    triangles each (``closed.close``).
     """
     seen = sight(obj, cameras, resolution)
     shown = [seen.surface(k) for k in range(len(obj.parts))]
@@ -66,7 +68,8 @@ def part_meshes(
     if not closed:
         return [replace(b, guessed=_added(a, b)) for a, b in zip(shown, done, strict=True)]
     return [
-        close(a, b, seen.views, seen.poses[k], k, seen.voxel) for k, (a, b) in enumerate(zip(shown, done, strict=True))
+        close(a, b, seen.views, seen.poses[k], k, seen.voxel, max_faces)
+        for k, (a, b) in enumerate(zip(shown, done, strict=True))
     ]
 
 
@@ -121,7 +124,7 @@ def write_meshes(run_dir: Path | str, resolution: int = RESOLUTION, log=None) ->
         obj = largest_clusters(obj, options.cluster)
     with rasterizer_of(run_dir):
         cameras = mesh_cameras(obj, read_cameras(run_dir / "cameras.json"))
-        meshes = part_meshes(obj, cameras, resolution, options.complete, options.closed)
+        meshes = part_meshes(obj, cameras, resolution, options.complete, options.closed, options.max_faces)
         wholes = [separate_whole(obj, cameras, t, resolution) for t in (0, 1)] if options.whole == "separate" else None
     if not any(len(m.faces) for m in meshes):
         raise UserError(f"{run_dir}: the twin shows no surface from any of its cameras, so there is nothing to mesh")

@@ -13,17 +13,19 @@ import torch
 from p2gs.gaussians.pose import pose
 from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh
+from p2gs.surface.closed import FACES
 from p2gs.surface.sightings import RESOLUTION, sight
 from p2gs.types import ArticulatedObject, Camera, Part, UserError
 
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """``complete``, ``closed``, ``whole`` and ``cluster`` of ``phases.finish`` (``models.finish.FinishConfig`` says
-    what they mean)."""
+    """``complete``, ``closed``, ``max_faces``, ``whole`` and ``cluster`` of ``phases.finish``
+    (``models.finish.FinishConfig`` says what they mean)."""
 
     complete: bool = True
-    closed: bool = False
+    closed: bool = True
+    max_faces: int = FACES
     whole: Literal["joined", "separate"] = "joined"
     cluster: float = 0.0
 
@@ -42,7 +44,8 @@ def surface_options(run_dir: Path | str) -> SurfaceOptions:
         return SurfaceOptions(**{f.name: given[f.name] for f in fields(SurfaceOptions) if f.name in given})
     except (yaml.YAMLError, AttributeError, ValueError, TypeError, RecursionError, OverflowError) as err:
         raise UserError(
-            f"{path}: phases.finish cannot be read ({err}); expected a mapping with complete, closed, whole and cluster"
+            f"{path}: phases.finish cannot be read ({err}); expected a mapping with "
+            f"{', '.join(f.name for f in fields(SurfaceOptions))}"
         ) from err
 
 

@@ -11,7 +11,8 @@ from traced import CRATE, boards, seen
 
 from p2gs.metrics.chamfer import sample_surface
 from p2gs.ops.mesh import Mesh
-from p2gs.surface.closed import close, points_on, simplified
+from p2gs.surface.closed import TRUNCATION, Cells, boundary, close, points_on, simplified, without_scraps
+from p2gs.surface.faces import Faces
 from p2gs.surface.tsdf import fuse
 from p2gs.surface.unseen import close_unseen_sides
 
@@ -99,12 +100,36 @@ def test_points_on_a_mesh_leave_no_gaps():
     assert gap.max() < 0.05 and len(points_on(Mesh.empty(), 0.1)) == 0
 
 
-def test_simplified_meshes_stay_closed_and_near():
+@pytest.mark.parametrize("max_faces", [2000, 4])
+def test_simplified_meshes_stay_closed_and_near(max_faces):
+    """Down to as many triangles as are asked for, or as the error allows."""
     ball = trimesh.creation.icosphere(subdivisions=5)
-    out = simplified(Mesh(ball.vertices + 7, ball.faces), 0.01)
+    out = simplified(Mesh(ball.vertices + 7, ball.faces), 0.02, max_faces)
     solid = solid_of(out)
     radius = np.linalg.norm(sample_surface(out, 2000) - 7, axis=1)
-    assert len(out.faces) < len(ball.faces) / 4 and np.abs(radius - 1).max() < 0.015
+    assert len(out.faces) <= 2000 and np.abs(radius - 1).max() < 0.02
+    assert max_faces == 4 or len(out.faces) > 1900
     assert solid.volume == pytest.approx(4 / 3 * math.pi, rel=0.02)
     with pytest.raises(ValueError, match="not closed"):
-        simplified(Mesh(ball.vertices, ball.faces[1:]), 0.01)
+        simplified(Mesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] > 0]), 0.01, max_faces)
+
+
+def test_scraps_go_and_voids_stay():
+    ball, void, scrap = (trimesh.creation.icosphere(2, radius) for radius in (1.0, 0.5, 0.05))
+    void.invert()
+    scrap.apply_translation([3, 0, 0])
+    mesh = Mesh.of(trimesh.util.concatenate([ball, void, scrap]))
+    volume = ball.volume + void.volume
+    assert solid_of(without_scraps(mesh, 0.001)).volume == pytest.approx(volume)
+    assert solid_of(without_scraps(mesh, 0.0001)).volume == pytest.approx(volume + scrap.volume)
+
+
+def test_a_surface_that_passes_middles_of_cells_has_no_steps():
+    """A plane that rises by a twentieth of a cell from cell to cell."""
+    x, _, z = np.mgrid[:60, :10, :20].astype(np.float32)
+    field = ((z - 8.2 - x / 20) / TRUNCATION).clip(-1, 1)
+    ones = np.ones(field.shape, np.float32)
+    cells = Cells(np.zeros(3), 1.0, ones > 0, field, ones, ones)
+    mesh = boundary(cells, field < 0, field > 1)
+    assert np.quantile(Faces(mesh).normal[:, 2], 0.01) > 0.99
+    assert np.abs(mesh.vertices[:, 2] - 8.2 - mesh.vertices[:, 0] / 20).max() < 0.02

@@ -19,9 +19,9 @@ from p2gs.types import UserError
 def test_options_are_read_from_the_runs_config(tmp_path):
     assert surface_options(tmp_path) == SurfaceOptions()
     (tmp_path / "config.yaml").write_text(
-        "phases: {finish: {complete: false, closed: false, whole: separate, cluster: 0.05, trays: 0}}"
+        "phases: {finish: {complete: false, closed: false, max_faces: 500, whole: separate, cluster: 0.05, trays: 0}}"
     )
-    assert surface_options(tmp_path) == SurfaceOptions(False, False, "separate", 0.05)
+    assert surface_options(tmp_path) == SurfaceOptions(False, False, 500, "separate", 0.05)
     (tmp_path / "config.yaml").write_text("phases: [1]")
     with pytest.raises(UserError, match="expected a mapping"):
         surface_options(tmp_path)
@@ -65,7 +65,7 @@ def test_nothing_is_completed_where_it_is_not_wanted():
     bare = part_meshes(twin, cameras, 40, complete=False)
     for k, mesh in enumerate(bare):
         assert (mesh.faces == seen.surface(k).faces).all()
-    full = part_meshes(twin, cameras, 40)
+    full = part_meshes(twin, cameras, 40, closed=False)
     assert sum(len(m.faces) for m in full) != sum(len(m.faces) for m in bare)
     assert not any(m.guessed.any() for m in bare)
     for part, all_of_it in zip(bare, full, strict=True):
@@ -76,7 +76,7 @@ def test_nothing_is_completed_where_it_is_not_wanted():
 def test_closed_meshes_are_watertight_and_say_what_is_guessed():
     twin = toy_twin()
     cameras = [(c.state, c.camera) for c in scene_cameras(toy_scene())]
-    for mesh in part_meshes(twin, cameras, 40, closed=True):
+    for mesh in part_meshes(twin, cameras, 40):
         assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
         assert mesh.guessed.any() and not mesh.guessed.all()
 
