@@ -3,8 +3,9 @@
     python bench/surface_steps.py RUN... [--out FILE] [--threads N]
 
 The meshes of a finished run are made anew, as ``fit`` makes them before it closes them and without each step of them,
-and scored as ``p2gs test`` scores them. A line of JSON per run goes to FILE: Chamfer distance (x1000) of the static part, the moving
-parts' mean and the whole, and triangles, with everything ("all") and without each step that changes them.
+and scored as ``p2gs test`` scores them. A line of JSON per run goes to FILE: Chamfer distance (x1000) of the static
+part, the moving parts' mean and the whole, and triangles, with everything ("all") and without each step that changes
+them.
 """
 
 from __future__ import annotations

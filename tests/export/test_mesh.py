@@ -207,7 +207,7 @@ def run(tmp_path_factory):
 
 
 def test_cabinet_meshes_lie_on_its_panels(run):
-    """What was seen of a part's surface lies on that part's panels, in both states, and what closes it within two voxels
+    """In both states what was seen of a part's surface lies on that part's panels, and what closes it within two voxels
     of them; and the part's visible front is there."""
     panels, joints = start_parts()
     twin = object_to_input(toy_twin())
