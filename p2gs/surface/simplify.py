@@ -26,7 +26,7 @@ def simplify(mesh: Mesh, max_faces: int, error: float | None = None) -> Mesh:
     scale = np.sqrt(1e-9 * (PASSES + 2) ** RISE) / (LARGEST * size if error is None else error)
     points = np.ascontiguousarray((mesh.vertices - middle) * scale)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
-    points, faces = fast_simplification.simplify(points, faces, target_count=max_faces, agg=RISE)
-    vertices = np.asarray(points, np.float64) / scale + middle
+    found = fast_simplification.simplify(points, faces, target_count=max_faces, agg=RISE)
+    vertices = np.asarray(found[0], np.float64) / scale + middle
     colours = mesh.colours[search_tree(mesh.vertices).query(vertices)[1]]
-    return Mesh(vertices, np.asarray(faces, np.int64), colours).without_unused()
+    return Mesh(vertices, np.asarray(found[1], np.int64), colours).without_unused()
