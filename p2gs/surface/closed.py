@@ -22,7 +22,7 @@ from p2gs.ops.mesh import Mesh, components
 from p2gs.surface.depth_view import DepthView, pixel_matrix, seen_points
 from p2gs.surface.integrate import integrate
 from p2gs.surface.simplify import simplify
-from p2gs.surface.tsdf import ActiveGrid
+from p2gs.surface.tsdf import ActiveGrid, vertex_normals
 
 # voxels before and behind a surface within which it counts (tsdf.fuse: the walls are thin)
 TRUNCATION, BEHIND = 4.0, 1.5
@@ -38,6 +38,7 @@ CLEAR, OTHERWISE = 0.005, 0.05
 # storage4's and fridge2's surfaces stay within half a voxel
 ERROR = 2.0
 FACES = 20_000  # triangles of a part, where ERROR allows
+APART = 0.01  # voxels by which surfaces that touch are pulled apart: readers merge vertices of one place
 
 
 @dataclass
@@ -109,6 +110,7 @@ def close(
     if not solid.any():
         return Mesh.empty()
     mesh = without_scraps(simplified(boundary(cells, solid, guess), ERROR * voxel, max_faces), voxel**3)
+    mesh = pulled_apart(mesh, APART * voxel)
     colours = done.colours[search_tree(done.vertices).query(mesh.vertices)[1]]
     return replace(mesh, colours=colours, guessed=_unseen(mesh, cells))
 
@@ -198,6 +200,16 @@ def without_scraps(mesh: Mesh, volume: float) -> Mesh:
     a, b, c = ((mesh.vertices - mesh.vertices.mean(0))[mesh.faces[:, i]] for i in range(3))
     enclosed = np.bincount(piece, (a * np.cross(b, c)).sum(1)) / 6  # negative for a void
     return mesh.only((np.abs(enclosed) >= volume)[piece])
+
+
+def pulled_apart(mesh: Mesh, distance: float) -> Mesh:
+    """A closed mesh whose vertices of one place each went ``distance`` into the solid, away from one another."""
+    _, place, count = np.unique(mesh.vertices, axis=0, return_inverse=True, return_counts=True)
+    shared = (count > 1)[place.reshape(-1)]
+    inward = -vertex_normals(mesh.vertices, mesh.faces)[shared]
+    vertices = mesh.vertices.copy()
+    vertices[shared] += distance * inward
+    return replace(mesh, vertices=vertices)
 
 
 def _unseen(mesh: Mesh, cells: Cells) -> np.ndarray:

@@ -11,7 +11,16 @@ from traced import CRATE, boards, seen
 
 from p2gs.metrics.chamfer import sample_surface
 from p2gs.ops.mesh import Mesh
-from p2gs.surface.closed import TRUNCATION, Cells, boundary, close, points_on, simplified, without_scraps
+from p2gs.surface.closed import (
+    TRUNCATION,
+    Cells,
+    boundary,
+    close,
+    points_on,
+    pulled_apart,
+    simplified,
+    without_scraps,
+)
 from p2gs.surface.faces import Faces
 from p2gs.surface.tsdf import fuse
 from p2gs.surface.unseen import close_unseen_sides
@@ -122,6 +131,18 @@ def test_scraps_go_and_voids_stay():
     volume = ball.volume + void.volume
     assert solid_of(without_scraps(mesh, 0.001)).volume == pytest.approx(volume)
     assert solid_of(without_scraps(mesh, 0.0001)).volume == pytest.approx(volume + scrap.volume)
+
+
+def test_solids_that_touch_along_an_edge_are_pulled_apart():
+    """Closed also where a reader merges vertices of one place."""
+    boxes = [trimesh.creation.box((4, 4, 2)).subdivide().subdivide() for _ in range(2)]
+    boxes[1].apply_translation([4, 4, 0])
+    mesh = Mesh.of(trimesh.util.concatenate(boxes))
+    assert not trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
+    apart = pulled_apart(mesh, 0.01)
+    merged = trimesh.Trimesh(apart.vertices.astype(np.float32), apart.faces)
+    assert merged.is_watertight and merged.volume == pytest.approx(64, rel=0.001)
+    assert np.abs(apart.vertices - mesh.vertices).max() <= 0.01 and (apart.vertices != mesh.vertices).any(1).sum() == 10
 
 
 def test_a_surface_that_passes_middles_of_cells_has_no_steps():
