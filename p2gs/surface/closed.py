@@ -195,11 +195,12 @@ def simplified(mesh: Mesh, error: float, max_faces: int) -> Mesh:
 
 
 def without_scraps(mesh: Mesh, volume: float) -> Mesh:
-    """A closed mesh without its pieces that enclose less than ``volume``: what collapses pinched off."""
+    """A closed mesh without its pieces that enclose less than ``volume``, what collapses pinched off; the largest
+    stays."""
     piece = components(mesh)
     a, b, c = ((mesh.vertices - mesh.vertices.mean(0))[mesh.faces[:, i]] for i in range(3))
     enclosed = np.bincount(piece, (a * np.cross(b, c)).sum(1)) / 6  # negative for a void
-    return mesh.only((np.abs(enclosed) >= volume)[piece])
+    return mesh.only((np.abs(enclosed) >= min(volume, enclosed.max()))[piece])
 
 
 def pulled_apart(mesh: Mesh, distance: float) -> Mesh:

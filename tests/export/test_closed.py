@@ -131,6 +131,7 @@ def test_scraps_go_and_voids_stay():
     volume = ball.volume + void.volume
     assert solid_of(without_scraps(mesh, 0.001)).volume == pytest.approx(volume)
     assert solid_of(without_scraps(mesh, 0.0001)).volume == pytest.approx(volume + scrap.volume)
+    assert solid_of(without_scraps(mesh, 1000.0)).volume == pytest.approx(ball.volume)  # the largest, be it small
 
 
 def test_solids_that_touch_along_an_edge_are_pulled_apart():
