@@ -82,6 +82,9 @@ def _test(commands) -> None:
     test.add_argument("run", metavar="RUN", help="result folder of a fit")
     test.add_argument("--root", metavar="DIR", help="the scene's folder, where it has moved since the fit")
     test.add_argument("--truth", metavar="DIR", help="a capture's true cameras, joints and meshes: score in metres")
+    test.add_argument(
+        "--match", choices=("joints", "mesh"), default="joints", help="which parts belong together: by joint or by mesh"
+    )
 
 
 def _predict(commands) -> None:

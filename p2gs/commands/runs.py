@@ -56,7 +56,7 @@ def test(args: argparse.Namespace) -> int:
             print(line)
         print(f"written: {run / 'capture_metrics.json'}")
         return 0
-    rich_print(score_tables(evaluate_run(run, args.root)))
+    rich_print(score_tables(evaluate_run(run, args.root, args.match)))
     write_hparams(run)
     if (run / "report.html").is_file():
         write_report(run)

@@ -5,6 +5,7 @@ ground truth.
 ``missing``:
 
     scene, num_parts, gaussians            name of the scene; counts of the twin
+    match        how true parts found their predicted ones: "joints" or "mesh"
     parts        [{id, gaussians}]
     joints       {joints: [{gt, type, pred, pred_type, errors: {axis_angle, axis_position, motion} | null}], failures,
     extra, ...means}:
@@ -27,8 +28,9 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Optional
+from typing import TYPE_CHECKING, Literal, Optional
 
 import numpy as np
 
@@ -36,6 +38,7 @@ from p2gs.gaussians.paint import draw, rasterizer_of
 from p2gs.gaussians.pose import pose
 from p2gs.gaussians.twin_json import load_twin
 from p2gs.gaussians.views import bounds
+from p2gs.metrics.chamfer import PartMeshes, is_empty, match_parts, read_part_meshes
 from p2gs.metrics.lpips import wanted as lpips_wanted
 from p2gs.metrics.lpips import why_absent
 from p2gs.metrics.modules import JointError, PartChamfer, Penetration, ViewQuality
@@ -52,11 +55,24 @@ FORMAT = "p2gs-metrics/1"
 STATES = ("start", "end")
 
 
-def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict:
+@dataclass
+class Surfaces:
+    """Part meshes by state's name: the twin's ``made``, these without guessed faces, and the ``true`` ones."""
+
+    made: dict[str, PartMeshes]
+    seen: dict[str, PartMeshes]
+    true: dict[str, PartMeshes]
+
+
+def evaluate_run(
+    run_dir: Path | str, root: Optional[Path | str] = None, match: Literal["joints", "mesh"] = "joints"
+) -> dict:
     """Score a run, write RUN/metrics.json and return what it holds.
 
-    root: the scene's folder where it has moved since the fit. Raises UserError when the run is not finished or the
-    scene's photographs cannot be read; a scene without ground truth is scored by its photographs alone.
+    root: the scene's folder where it has moved since the fit. match: true parts take the predicted ones whose joints
+    are nearest, as ArtGS has it, or whose meshes are (``match_parts``). Raises UserError when the run is not finished,
+    the scene's photographs cannot be read, or there are no meshes to match by; a scene without ground truth is scored
+    by its photographs alone.
     """
     began = time.perf_counter()
     run_dir = Path(run_dir)
@@ -68,11 +84,15 @@ def evaluate_run(run_dir: Path | str, root: Optional[Path | str] = None) -> dict
     if truth is None:
         missing.append("the scene has no ground-truth joints or meshes")
     else:
+        surfaces = read_surfaces(run_dir, truth, missing)
+        if match == "mesh" and surfaces is None:
+            raise UserError(f"{run_dir}: there are no meshes to match parts by: {missing[-1]}")
+        assignment = match_parts(surfaces.made, surfaces.true) if match == "mesh" and surfaces is not None else None
         joints = JointError()
-        joints.update([p.joint for p in obj.parts if p.joint is not None], truth.joints)
-        metrics["joints"] = joints.report.to_dict()
-        chamfer = surface_scores(run_dir, truth, joints.report.assignment, missing)
-        if chamfer is not None:
+        joints.update([p.joint for p in obj.parts if p.joint is not None], truth.joints, assignment)
+        metrics["match"], metrics["joints"] = match, joints.report.to_dict()
+        if surfaces is not None:
+            chamfer = surface_scores(surfaces, joints.report.assignment, missing)
             metrics["chamfer"], metrics["chamfer_seen"] = chamfer
     with rasterizer_of(run_dir):
         metrics["views"] = view_scores(obj, scene, missing)
@@ -155,13 +175,8 @@ def view_scores(obj: ArticulatedObject, scene: TwoStateScene, missing: list[str]
     return out
 
 
-def surface_scores(
-    run_dir: Path, truth: "GroundTruth", assignment: dict[int, int], missing: list[str]
-) -> Optional[tuple[dict, dict]]:
-    """Chamfer distances of RUN/meshes against the ground truth's, and of their faces that are not guessed; None where
-    either is missing."""
-    from p2gs.metrics.chamfer import PartMeshes, is_empty, read_part_meshes
-
+def read_surfaces(run_dir: Path, truth: "GroundTruth", missing: list[str]) -> Optional[Surfaces]:
+    """RUN/meshes and the ground truth's; None, and a sentence more in ``missing``, where either is missing."""
     pred, seen, gt = {}, {}, {}
     for state, name in enumerate(STATES):
         made, true = read_meshes(run_dir, name), truth.meshes(state)
@@ -178,13 +193,19 @@ def surface_scores(
         shown = [m.only(~m.guessed) for m in made]
         seen[name] = PartMeshes(shown[0], shown[1:], pred[name].whole)
         gt[name] = read_part_meshes(true.whole, true.static, true.dynamic)
+    return Surfaces(pred, seen, gt)
+
+
+def surface_scores(surfaces: Surfaces, assignment: dict[int, int], missing: list[str]) -> tuple[dict, dict]:
+    """Chamfer distances of the twin's meshes, and of their faces that are not guessed. assignment: true moving part ->
+    predicted one."""
     reports = []
-    for meshes in (pred, seen):
+    for meshes in (surfaces.made, surfaces.seen):
         chamfer = PartChamfer()
-        chamfer.update(meshes, gt, assignment)
+        chamfer.update(meshes, surfaces.true, assignment)
         reports.append(chamfer.report)
     if reports[0].static is None:
-        bare = all(m.static is None or is_empty(m.static) for m in gt.values())
+        bare = all(m.static is None or is_empty(m.static) for m in surfaces.true.values())
         whose = "ground truth's" if bare else "twin's"
         missing.append(f"the {whose} static part has no surface, so there is no Chamfer distance of it")
     return reports[0].to_dict(), reports[1].to_dict()

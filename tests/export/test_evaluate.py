@@ -131,6 +131,22 @@ def test_meshes_are_scored_against_the_true_ones(run, tmp_path, scene):
     )  # few coarse views: holes, but the right places
 
 
+def test_parts_of_one_joint_are_told_apart_by_their_meshes(run, tmp_path):
+    """Door and drawer have each other's joint in the truth: joints pair them wrongly, meshes rightly."""
+    swapped = GroundTruth(
+        tmp_path, tuple(start_parts()[1][::-1]), true_meshes(tmp_path, 0.0), true_meshes(tmp_path, 1.0)
+    )
+    folder = run(truth=swapped)
+    with pytest.raises(UserError, match="no meshes to match parts by: the run has no meshes"):
+        evaluate.evaluate_run(folder, match="mesh")
+    write_meshes(folder, resolution=40)
+    joints, mesh = (evaluate.evaluate_run(folder, match=m) for m in ("joints", "mesh"))
+    assert (joints["match"], mesh["match"]) == ("joints", "mesh")
+    assert [j["pred"] for j in joints["joints"]["joints"]] == [1, 0]
+    assert [j["pred"] for j in mesh["joints"]["joints"]] == [0, 1] and mesh["joints"]["failures"] == 2
+    assert mesh["chamfer"]["movable"]["value"] < 20 < joints["chamfer"]["movable"]["value"]
+
+
 def test_a_joint_not_found_is_a_failure_in_the_table(run):
     from rich.console import Console
 

@@ -9,7 +9,7 @@ from toy import toy_scene, toy_twin
 from p2gs.export.run_folder import write_twin
 from p2gs.gaussians.views import bounds, scene_cameras
 from p2gs.ops.mesh import Mesh
-from p2gs.scores.evaluate import surface_scores
+from p2gs.scores.evaluate import read_surfaces, surface_scores
 from p2gs.surface.mesh import part_meshes, read_mesh, write_meshes
 from p2gs.surface.protocol import SurfaceOptions, largest_clusters, surface_options
 from p2gs.surface.sightings import sight
@@ -104,9 +104,9 @@ def test_the_whole_of_its_own_is_written_and_scored(tmp_path):
             return SimpleNamespace(static=folder / "part_0.ply", dynamic=dynamic, whole=None)
 
     assignment = {k: k for k in range(len(twin.parts) - 1)}
-    apart, _ = surface_scores(tmp_path, Truth, assignment, [])
+    apart, _ = surface_scores(read_surfaces(tmp_path, Truth, []), assignment, [])
     (tmp_path / "config.yaml").write_text("phases: {finish: {complete: false}}")
-    together, _ = surface_scores(tmp_path, Truth, assignment, [])
+    together, _ = surface_scores(read_surfaces(tmp_path, Truth, []), assignment, [])
     assert (
         apart["static"]["value"] == together["static"]["value"]
         and apart["whole"]["value"] > 1.2 * together["whole"]["value"]
