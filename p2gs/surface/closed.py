@@ -20,16 +20,16 @@ from torch import Tensor
 from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh, components
 from p2gs.surface.depth_view import DepthView, pixel_matrix, seen_points
-from p2gs.surface.integrate import integrate
+from p2gs.surface.integrate import FREE_WEIGHT, integrate
+from p2gs.surface.sightings import TRUNCATION
 from p2gs.surface.simplify import simplify
 from p2gs.surface.tsdf import ActiveGrid, vertex_normals
 
-# voxels before and behind a surface within which it counts (tsdf.fuse: the walls are thin)
-TRUNCATION, BEHIND = 4.0, 1.5
-ENOUGH = 0.3  # weight of views at which their vote is worth half of many views' (FREE_WEIGHT: of one that sees through)
+# voxels behind a surface within which it counts (tsdf.fuse: the walls are thin), and to either side within which a
+# point is on it
+BEHIND = 1.5
 HOLLOW = 0.3  # votes for free of a cell that nobody saw
 FACE = 0.05  # votes that a voxel's face costs: a plate with less to say for it than for two of its faces goes
-BESIDE = 1.5  # voxels from a surface within which a point is on it
 PIECE = 0.1  # share of the largest piece's cells below which a piece goes
 # of TRUNCATION: how near to a cell's middle the surface may pass (no corner of a triangle lies on a cell), and by how
 # much at most a cell that the cut has otherwise than its distance says is on the other side
@@ -77,9 +77,9 @@ class Cells:
         return out
 
     def votes(self, beside: np.ndarray) -> np.ndarray:
-        """Votes of the views, for solid where positive, [X, Y, Z]; those for solid count only ``beside`` [X, Y, Z] bool
-        a surface that was found."""
-        votes = -np.clip(TRUNCATION * self.field, -1, 1) * self.weight / (self.weight + ENOUGH)
+        """Votes of the views, for solid where positive, [X, Y, Z]: of one that sees through half a vote, of many nearly
+        a whole one. Those for solid count only ``beside`` [X, Y, Z] bool a surface that was found."""
+        votes = -np.clip(TRUNCATION * self.field, -1, 1) * self.weight / (self.weight + FREE_WEIGHT)
         return np.where((self.weight == 0) | ((votes > 0) & ~beside), -HOLLOW, votes)
 
 
@@ -104,9 +104,9 @@ def close(
     points = [seen_points(v, part, T) for v, T in zip(views, poses, strict=True)]
     cells = Cells.around([*points, torch.as_tensor(made)], views, poses, part, voxel)
     before, after = cells.holding(kept), cells.holding(made)
-    beside = _within(before, BESIDE)
+    beside = _within(before, BEHIND)
     guess = after & (~beside | (cells.sighted == 0))  # up to the seen surface, without a gap
-    solid = _solid(cells, beside, guess, before & ~_within(after, BESIDE))
+    solid = _solid(cells, beside, guess, before & ~_within(after, BEHIND))
     if not solid.any():
         return Mesh.empty()
     mesh = without_scraps(simplified(boundary(cells, solid, guess), ERROR * voxel, max_faces), voxel**3)

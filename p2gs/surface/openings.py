@@ -19,7 +19,7 @@ from p2gs.gaussians.draw import render_gaussians
 from p2gs.gaussians.handover import PartMotions, StateGaussians
 from p2gs.ops import se3
 from p2gs.ops.knn import knn
-from p2gs.parts.islands import find_islands
+from p2gs.parts.islands import SOLID, find_islands
 from p2gs.parts.patches import patches
 from p2gs.render.base import MAX_FEATURES
 from p2gs.surface.boards import Rays, find_boards
@@ -29,7 +29,6 @@ from p2gs.visibility.depth_stack import DepthStack
 from p2gs.visibility.evidence import render_depths
 from p2gs.visibility.free_space import SURFACE, landed, out_of_sight
 
-SOLID = 0.3  # opacity from which a Gaussian is surface
 # share of the most Gaussians that any backdrop lets give way from which on backdrops are held against the photographs
 ALIKE = 0.9
 APART = 0.25  # share of a part's largest piece below which another one is apart from it

@@ -12,7 +12,6 @@ from traced import CRATE, boards, seen
 from p2gs.metrics.chamfer import sample_surface
 from p2gs.ops.mesh import Mesh
 from p2gs.surface.closed import (
-    TRUNCATION,
     Cells,
     boundary,
     close,
@@ -22,6 +21,7 @@ from p2gs.surface.closed import (
     without_scraps,
 )
 from p2gs.surface.faces import Faces
+from p2gs.surface.sightings import TRUNCATION
 from p2gs.surface.tsdf import fuse
 from p2gs.surface.unseen import close_unseen_sides
 
