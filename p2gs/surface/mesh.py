@@ -13,6 +13,7 @@ import torch
 from p2gs.gaussians.paint import rasterizer_of
 from p2gs.gaussians.twin_json import load_twin
 from p2gs.gaussians.views import NamedCamera, orbit, read_cameras
+from p2gs.native import at_once
 from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh
 from p2gs.surface.bridges import bridged
@@ -61,16 +62,15 @@ def part_meshes(
     triangles each (``closed.close``).
     """
     seen = sight(obj, cameras, resolution)
-    shown = [seen.surface(k) for k in range(len(obj.parts))]
+    shown = at_once(seen.surface, range(len(obj.parts)))
     if not complete:
         return shown
     done = completed(obj, seen, shown)
     if not closed:
         return [replace(b, guessed=_added(a, b)) for a, b in zip(shown, done, strict=True)]
-    return [
-        close(a, b, seen.views, seen.poses[k], k, seen.voxel, max_faces)
-        for k, (a, b) in enumerate(zip(shown, done, strict=True))
-    ]
+    return at_once(
+        lambda k: close(shown[k], done[k], seen.views, seen.poses[k], k, seen.voxel, max_faces), range(len(shown))
+    )
 
 
 def _added(shown: Mesh, done: Mesh) -> np.ndarray:
