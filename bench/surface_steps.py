@@ -30,7 +30,7 @@ from p2gs.metrics.modules import JointError
 from p2gs.ops.mesh import Mesh
 from p2gs.scores.evaluate import open_scene
 from p2gs.surface.sightings import start_motion
-from p2gs.types import ArticulatedObject, UserError
+from p2gs.types import UserError
 
 
 def as_given(first, *rest, **options):
@@ -80,11 +80,6 @@ def scored(obj, meshes: list[Mesh], true: dict, assignment: dict[int, int]) -> d
     }
 
 
-def surfaces(obj: ArticulatedObject, seen: sightings.Sightings) -> list[Mesh]:
-    """What was seen of each part."""
-    return [seen.surface(k) for k in range(len(obj.parts))]
-
-
 def steps(run: Path) -> dict:
     """A run's line."""
     obj, truth = load_twin(run), open_scene(run)[1]
@@ -100,10 +95,10 @@ def steps(run: Path) -> dict:
     with rasterizer_of(run):
         cameras = meshing.mesh_cameras(obj, read_cameras(run / "cameras.json"))
         seen = meshing.sight(obj, cameras)
-        shown = surfaces(obj, seen)
+        shown = seen.surfaces()
         for name in (None, *STEPS):
             with left_out(name):
-                meshes = meshing.completed(obj, seen, surfaces(obj, seen) if name in SEEN else shown)
+                meshes = meshing.completed(obj, seen, seen.surfaces() if name in SEEN else shown)
             if name is not None and same(meshes, everything):
                 continue
             everything = everything or meshes

@@ -83,7 +83,10 @@ def _test(commands) -> None:
     test.add_argument("--root", metavar="DIR", help="the scene's folder, where it has moved since the fit")
     test.add_argument("--truth", metavar="DIR", help="a capture's true cameras, joints and meshes: score in metres")
     test.add_argument(
-        "--match", choices=("joints", "mesh"), default="joints", help="which parts belong together: by joint or by mesh"
+        "--match",
+        choices=("joints", "mesh"),
+        default="joints",
+        help="which parts belong together: by joint or by mesh (not with --truth)",
     )
 
 

@@ -85,9 +85,11 @@ def evaluate_run(
         missing.append("the scene has no ground-truth joints or meshes")
     else:
         surfaces = read_surfaces(run_dir, truth, missing)
-        if match == "mesh" and surfaces is None:
-            raise UserError(f"{run_dir}: there are no meshes to match parts by: {missing[-1]}")
-        assignment = match_parts(surfaces.made, surfaces.true) if match == "mesh" and surfaces is not None else None
+        assignment = None
+        if match == "mesh":
+            if surfaces is None:
+                raise UserError(f"{run_dir}: there are no meshes to match parts by: {missing[-1]}")
+            assignment = match_parts(surfaces.made, surfaces.true)
         joints = JointError()
         joints.update([p.joint for p in obj.parts if p.joint is not None], truth.joints, assignment)
         metrics["match"], metrics["joints"] = match, joints.report.to_dict()

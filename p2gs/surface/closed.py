@@ -20,9 +20,10 @@ from torch import Tensor
 from p2gs.ops.knn import search_tree
 from p2gs.ops.mesh import Mesh, components
 from p2gs.surface.depth_view import DepthView, pixel_matrix, seen_points
+from p2gs.surface.faces import Faces
 from p2gs.surface.integrate import FREE_WEIGHT, integrate
 from p2gs.surface.sightings import TRUNCATION
-from p2gs.surface.simplify import simplify
+from p2gs.surface.simplify import collapsed
 from p2gs.surface.tsdf import ActiveGrid, vertex_normals
 
 # voxels behind a surface within which it counts (tsdf.fuse: the walls are thin), and to either side within which a
@@ -185,7 +186,7 @@ def simplified(mesh: Mesh, error: float, max_faces: int) -> Mesh:
     import manifold3d
 
     middle = mesh.vertices.mean(0)  # manifold3d has float32
-    fewer = simplify(mesh, max_faces, error)
+    fewer = collapsed(mesh, max_faces, error)
     shape = manifold3d.Mesh((fewer.vertices - middle).astype(np.float32), fewer.faces.astype(np.uint32))
     solid = manifold3d.Manifold(shape)  # where collapses made surfaces touch, they are taken apart
     if solid.status() != manifold3d.Error.NoError:
@@ -216,8 +217,6 @@ def pulled_apart(mesh: Mesh, distance: float) -> Mesh:
 def _unseen(mesh: Mesh, cells: Cells) -> np.ndarray:
     """Faces [F] bool before which no view saw surface: a voxel before a seen one there is a cell that it had a say
     in."""
-    corners = mesh.vertices[mesh.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    at = np.round((corners.mean(1) + cells.voxel * normal - cells.origin) / cells.voxel).astype(int)
+    faces = Faces(mesh)
+    at = np.round((faces.middle + cells.voxel * faces.normal - cells.origin) / cells.voxel).astype(int)
     return cells.sighted[tuple(at.clip(0, np.array(cells.near.shape) - 1).T)] == 0

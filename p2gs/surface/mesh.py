@@ -62,7 +62,7 @@ def part_meshes(
     triangles each (``closed.close``).
     """
     seen = sight(obj, cameras, resolution)
-    shown = at_once(seen.surface, range(len(obj.parts)))
+    shown = seen.surfaces()
     if not complete:
         return shown
     done = completed(obj, seen, shown)

@@ -12,6 +12,7 @@ from torch import Tensor
 from p2gs.gaussians.paint import draw
 from p2gs.gaussians.pose import part_transform, pose
 from p2gs.gaussians.views import bounds
+from p2gs.native import at_once
 from p2gs.ops.blend import likeliest
 from p2gs.ops.mesh import Mesh
 from p2gs.ops.pixels import greatest_around
@@ -112,6 +113,10 @@ class Sightings:
         """What was seen of the k-th part, in the start state, without crumbs."""
         mesh = fuse(self.views, self.poses[k], k, self.voxel, trunc=TRUNCATION * self.voxel, behind=BEHIND * self.voxel)
         return without_crumbs(mesh, self.views, self.poses[k], self.voxel)
+
+    def surfaces(self) -> list[Mesh]:
+        """``surface`` of every part."""
+        return at_once(self.surface, range(len(self.motions)))
 
     def tray(self, k: int, mesh: Mesh, body: Mesh) -> Optional[Tray]:
         """``find_tray`` for the k-th part, which slides, of which ``mesh`` was seen."""

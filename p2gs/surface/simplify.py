@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from p2gs.ops.knn import search_tree
@@ -14,19 +16,25 @@ RISE, PASSES = 3.0, 100
 LARGEST = 0.1  # of the longest side: the error of what may have any, which no surface needs to get near
 
 
-def simplify(mesh: Mesh, max_faces: int, error: float | None = None) -> Mesh:
-    """About ``max_faces`` triangles where it has more, or as many as keep the surface within ``error`` (None: any) of
-    where it was, in the units of the mesh; vertices in the colour of the nearest, no face ``guessed``."""
+def simplify(mesh: Mesh, max_faces: int) -> Mesh:
+    """About ``max_faces`` triangles where it has more; vertices in the colour of the nearest, no face ``guessed``."""
     if len(mesh.faces) <= max_faces:
         return mesh
+    fewer = collapsed(mesh, max_faces, LARGEST * float(np.ptp(mesh.vertices, axis=0).max()))
+    return replace(fewer, colours=mesh.colours[search_tree(mesh.vertices).query(fewer.vertices)[1]])
+
+
+def collapsed(mesh: Mesh, max_faces: int, error: float) -> Mesh:
+    """The mesh, black, with about ``max_faces`` triangles where it has more, or as many as keep its surface within
+    ``error`` of where it was, in its units."""
+    if len(mesh.faces) <= max_faces:
+        return Mesh(mesh.vertices, mesh.faces)
     import fast_simplification
 
     middle = mesh.vertices.mean(0)
-    size = float(np.ptp(mesh.vertices, axis=0).max())
-    scale = np.sqrt(1e-9 * (PASSES + 2) ** RISE) / (LARGEST * size if error is None else error)
+    scale = np.sqrt(1e-9 * (PASSES + 2) ** RISE) / error
     points = np.ascontiguousarray((mesh.vertices - middle) * scale)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
     found = fast_simplification.simplify(points, faces, target_count=max_faces, agg=RISE)
     vertices = np.asarray(found[0], np.float64) / scale + middle
-    colours = mesh.colours[search_tree(mesh.vertices).query(vertices)[1]]
-    return Mesh(vertices, np.asarray(found[1], np.int64), colours).without_unused()
+    return Mesh(vertices, np.asarray(found[1], np.int64)).without_unused()
