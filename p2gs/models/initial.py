@@ -1,4 +1,4 @@
-"""Where a reconstruction starts: random points inside the state's silhouettes, or depth points."""
+"""Where a reconstruction starts: depth points, points on which photographs agree, random ones in the silhouettes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple, Sequence
 import torch
 from torch import Tensor
 
+from p2gs.models.swept import swept_points
 from p2gs.types import GaussianTensors, TwoStateScene, View
 
 HULL_MARGIN = 0.02  # of the image's long edge: silhouettes grow by it
@@ -14,38 +15,54 @@ HULL_SHARE = 0.9  # share of the views that must see a point inside
 
 
 class Start(NamedTuple):
-    """Points [N, 3] with colours [N, 3] in 0..1; measured: they are depth points."""
+    """Points [N, 3] with colours [N, 3] in 0..1; known [N] bool: they lie on surfaces, the others anywhere."""
 
     points: Tensor
     colours: Tensor
-    measured: bool
+    known: Tensor
 
 
 def initial_points(
     scene: TwoStateScene, state: int, counts: tuple[int, int], init: str, generator: torch.Generator
 ) -> Start:
-    """What a state starts from. counts: how many random points, how many depth points.
+    """What a state starts from. counts: how many points where there is no depth, how many depth points.
 
-    init "auto": depth points where every training view has depth, else as "random": uniform in the space that the
-    state's (slightly grown) silhouettes enclose. Not on that hull's surface, which would seal concavities; not in the
-    whole box either, since what no cropped view sees is never carved away.
+    init "auto": depth points where every training view has depth, else points on which the photographs agree
+    (``swept_points``), and random ones where these are too few. "random": random ones alone.
     """
     views, count = scene.select(state=state, split="train"), counts[0]
     if init == "auto" and scene.has_depth:
         points, colours = depth_points(views, counts[1], generator)
         if len(points) > 100:
-            return Start(points, colours, True)
+            return Start(points, colours, torch.ones(len(points), dtype=torch.bool))
     assert scene.box is not None  # every scene that is trained on has one
-    low, high = scene.box
-    found, tries = [], 0
+    points, colours = torch.zeros(2, 0, 3)
+    if init == "auto":
+        points, colours = swept_points(views, scene.box)
+        chosen = torch.randperm(len(points), generator=generator)[:count]
+        points, colours = points[chosen], colours[chosen]
+    rest = random_points(views, scene.box, count - len(points), generator)
+    known = torch.arange(count) < len(points)
+    return Start(torch.cat([points, rest]), torch.cat([colours, torch.full_like(rest, 0.5)]), known)
+
+
+def random_points(
+    views: Sequence[View], box: Tensor, count: int, generator: torch.Generator
+) -> Tensor:
+    """Points [count, 3], uniform in the space that the (slightly grown) silhouettes enclose.
+
+    Not on that hull's surface, which would seal concavities; not in the whole box either, since what no cropped view
+    sees is never carved away.
+    """
+    low, high = box
+    found, tries = [low.new_zeros(0, 3)], 0
     while sum(map(len, found)) < count and tries < 50:
         points = low + torch.rand(4 * count, 3, generator=generator) * (high - low)
         found.append(points[inside_masks(points, views)])
         tries += 1
     points = torch.cat(found)[:count]
-    if len(points) < count:  # masks that enclose next to nothing
-        points = torch.cat([points, low + torch.rand(count - len(points), 3, generator=generator) * (high - low)])
-    return Start(points, torch.full((count, 3), 0.5), False)
+    more = count - len(points)  # masks that enclose next to nothing
+    return torch.cat([points, low + torch.rand(more, 3, generator=generator) * (high - low)])
 
 
 def inside_masks(points: Tensor, views: Sequence[View], size: int = 100) -> Tensor:
@@ -89,8 +106,9 @@ def depth_points(views, count: int, generator: torch.Generator) -> tuple[Tensor,
     return torch.cat(points)[:count], torch.cat(colours)[:count]
 
 
-def isotropic_gaussians(points: Tensor, colours: Tensor, opacity: float, sh_degree: int) -> GaussianTensors:
-    """Round Gaussians at points [N, 3], as large as the mean distance to their three nearest neighbours."""
+def isotropic_gaussians(points: Tensor, colours: Tensor, opacity: Tensor, sh_degree: int) -> GaussianTensors:
+    """Round Gaussians of opacities [N] at points [N, 3], as large as the mean distance to their three nearest
+    neighbours."""
     from p2gs.ops.knn import knn
     from p2gs.ops.sh import rgb_to_dc
 
@@ -101,5 +119,4 @@ def isotropic_gaussians(points: Tensor, colours: Tensor, opacity: float, sh_degr
     sh[:, 0] = rgb_to_dc(colours)
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
-    logit = torch.logit(torch.tensor(opacity)).expand(n).contiguous()
-    return GaussianTensors(points.contiguous(), quats, log_scales, logit, sh)
+    return GaussianTensors(points.contiguous(), quats, log_scales, torch.logit(opacity), sh)

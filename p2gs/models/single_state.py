@@ -68,12 +68,12 @@ class SplatRates:
 class SingleStateConfig(ImageConfig):
     """Options of the single-state phase.
 
-    steps: paper 30,000. initial_gaussians: random points in the object's box, or depth_gaussians depth points where
-    ``init`` says so. sh_degree: 0-3. sh_every: steps until the next degree is switched on. init: "auto" takes depth
-    points where the scene has depth, "random" never does. initial_opacity: of random points, low, so that concavities
-    stay open until the images fill them; depth_opacity: of depth points. min_visible: Gaussians of which no training
-    view sees this share are left out at the end: nothing formed them (0 = keep all). forgive: errors of single
-    photographs.
+    steps: paper 30,000. initial_gaussians: how many where there is no depth; depth_gaussians: where there is.
+    sh_degree: 0-3. sh_every: steps until the next degree is switched on. init: "auto" starts on depth points where the
+    scene has depth, else on points on which its photographs agree, "random" anywhere in the silhouettes.
+    initial_opacity: of random points, low, so that concavities stay open until the images fill them; depth_opacity: of
+    points on surfaces. min_visible: Gaussians of which no training view sees this share are left out at the end:
+    nothing formed them (0 = keep all). forgive: errors of single photographs.
     """
 
     steps: int = 6000
@@ -207,7 +207,7 @@ class SingleStatePhase(StatePhase):
         super().__init__(config, losses, state, views, **common)
         counts = (config.initial_gaussians, config.depth_gaussians)
         start = initial_points(scene, state, counts, config.init, self.generator(0, 2))
-        opacity = config.depth_opacity if start.measured else config.initial_opacity
+        opacity = torch.where(start.known, config.depth_opacity, config.initial_opacity)
         self.splats = Splats(isotropic_gaussians(start.points, start.colours, opacity, config.sh_degree))
         self.shots = scene.select(state=state, split="train")
         self.errors, self.put_right = ViewErrors(len(self.shots)), None

@@ -37,5 +37,6 @@ void bind_repel(nb::module_& m);
 void bind_assign(nb::module_& m);
 void bind_cut(nb::module_& m);
 void bind_steps(nb::module_& m);
+void bind_sweep(nb::module_& m);
 
 }  // namespace p2gs

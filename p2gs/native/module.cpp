@@ -90,4 +90,5 @@ NB_MODULE(_native, m) {
     bind_repel(m);
     bind_cut(m);
     bind_steps(m);
+    bind_sweep(m);
 }

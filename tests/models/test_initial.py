@@ -26,24 +26,24 @@ def wall_scene(distance: float = 3.0) -> TwoStateScene:
         depth = torch.full((SIZE, SIZE), distance)
         depth[:, : SIZE // 4] = 0  # not known
         views.append(View(str(number), number % 2, "train", Camera(viewmat, K, SIZE, SIZE), image, alpha, depth))
-    return TwoStateScene("wall", tuple(views), box=(torch.full((3,), -1.5), torch.full((3,), 1.5)))
+    return TwoStateScene("wall", tuple(views), box=torch.tensor([[-1.5] * 3, [1.5] * 3]))
 
 
 def test_depth_points_lie_on_what_was_measured():
     scene = wall_scene()
     start = initial_points(scene, 0, (50, 300), "auto", torch.Generator().manual_seed(1))
-    assert start.measured and start.points.shape == start.colours.shape == (300, 3)
+    assert bool(start.known.all()) and start.points.shape == start.colours.shape == (300, 3)
     assert float(start.points[:, 2].abs().max()) < 1e-5  # the wall is the plane z = 0 of the world
     assert float(start.colours.std()) > 0.2
 
 
-@pytest.mark.parametrize("init, depth", [("random", True), ("auto", False)])
+@pytest.mark.parametrize("init, depth", [("random", True), ("random", False)])
 def test_random_points_where_depth_is_not_wanted_or_not_there(init, depth):
     scene = wall_scene()
     if not depth:
         scene = replace(scene, views=tuple(replace(v, depth=None) for v in scene.views))
     start = initial_points(scene, 0, (50, 300), init, torch.Generator().manual_seed(1))
-    assert not start.measured and len(start.points) == 50 and float(start.points[:, 2].abs().max()) > 0.1
+    assert not bool(start.known.any()) and len(start.points) == 50 and float(start.points[:, 2].abs().max()) > 0.1
 
 
 def test_depth_points_have_a_number_and_an_opacity_of_their_own():
