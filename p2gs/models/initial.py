@@ -46,9 +46,7 @@ def initial_points(
     return Start(torch.cat([points, rest]), torch.cat([colours, torch.full_like(rest, 0.5)]), known)
 
 
-def random_points(
-    views: Sequence[View], box: Tensor, count: int, generator: torch.Generator
-) -> Tensor:
+def random_points(views: Sequence[View], box: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Points [count, 3], uniform in the space that the (slightly grown) silhouettes enclose.
 
     Not on that hull's surface, which would seal concavities; not in the whole box either, since what no cropped view

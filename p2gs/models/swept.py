@@ -46,8 +46,8 @@ def swept_points(views: Sequence[View], box: Tensor) -> tuple[Tensor, Tensor]:
         points.append(camera.position + depths[index, None] * ways)
         colours.append(colour[:, :3] / colour[:, 3:])
         maps.append((_depth_map(camera, rows, cols, depths[index]), BESIDE * float(depths[1] - depths[0])))
-    found = torch.cat(points)
-    kept = _agreed(found, torch.cat([torch.full((len(p),), v) for v, p in enumerate(points)]), cameras, maps)
+    owner, found = torch.cat([torch.full((len(p),), v) for v, p in enumerate(points)]), torch.cat(points)
+    kept = ((found >= box[0]) & (found <= box[1])).all(1) & _agreed(found, owner, cameras, maps)
     return found[kept], torch.cat(colours)[kept]
 
 

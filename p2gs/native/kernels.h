@@ -21,6 +21,7 @@
 #include "raster.h"
 #include "repel.h"
 #include "ssim.h"
+#include "sweep.h"
 #include "views.h"
 
 namespace p2gs {
@@ -42,6 +43,7 @@ struct Kernels {
     RepelKernels repel;
     FuseKernels fuse;
     PlanarKernels planar;
+    SweepKernels sweep;
 };
 
 namespace avx512 { extern const Kernels table; }

@@ -6,15 +6,22 @@
 namespace p2gs {
 
 // pictures [views, height, width, 4], of which the first sizes [views, 2] (width, height) pixels are a view's; lines [views, 3, 4]: world -> pixel, times depth; rays: origins and ways [n, 3], colours [n, 4];
-// depths [steps]: points are origin + depth * way. tolerance: of the sum over the four channels, beyond which a view disagrees fully.
+// depths [steps]: points are origin + depth * way. tolerance: of the sum over the four channels, at which a view does not agree at all.
 struct Sweep {
     const float *pictures, *sizes, *lines, *origins, *ways, *colours, *depths;
     int64_t views, height, width, steps;
     float tolerance;
 };
 
-// best [n]: the step with the least mean disagreement (0 to 1) of the views that a point is in, the first of equal ones; cost [n]: that
-// mean, 1 where no view sees any of the points.
-void sweep(const Sweep& args, int64_t n, int64_t* best, float* cost, int threads);
+constexpr int64_t kSweepRays = 32;  // at a time: neighbours look at the same lines of a picture, which so stay in the cache
+
+struct SweepKernels {
+    // Rays [begin, end), at most kSweepRays: agreement summed over the views, [kSweepRays][steps], zero before.
+    void (*look)(const Sweep&, int64_t begin, int64_t end, float* sum);
+};
+
+// best [n]: the step at which the views agree best with the ray's colour, the first of equal ones; agreement [n]: their mean there, 0 to 1,
+// those that do not contain the point counting as 0. The same bits for any number of threads.
+void sweep(const Sweep& args, int64_t n, int64_t* best, float* agreement, int threads);
 
 }  // namespace p2gs

@@ -1,8 +1,8 @@
 """Depth along rays by all photographs at once: where most of them show one colour, a surface is.
 
 Plane sweeping (Collins 1996, https://doi.org/10.1109/CVPR.1996.517097) with every view instead of a few neighbours, and
-the disagreement of each view bounded (Vogiatzis et al. 2007, https://doi.org/10.1109/TPAMI.2007.70712, vote alike): views
-from which the surface is hidden disagree everywhere, so they tip no balance.
+bounded votes (as in Vogiatzis et al. 2007, https://doi.org/10.1109/TPAMI.2007.70712): a view from which the surface is
+hidden agrees nowhere on the ray, so it tips no balance.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def sweep(
     """Of the points origin + depth * way of each ray the one whose colour the views agree on best.
 
     origins, ways [N, 3]; colours [N, 4] of the rays; depths [D]; all float32. tolerance: sum over the channels of the
-    difference in colour beyond which a view disagrees fully.
-    Returns (index into depths [N] int64, the first of equal ones; mean disagreement [N] there, 0 to 1, of the views
-    that the point is in; 1 where none sees any). Raises ValueError on shapes that do not belong together.
+    difference in colour at which a view does not agree at all.
+    Returns (index into depths [N] int64, the first of equal ones; how well [N] the views agree there, 0 to 1 in the
+    mean, those that do not contain the point 0). Raises ValueError on shapes that do not belong together.
     """
     V = len(pictures.pixels)
     shapes = [tuple(t.shape) for t in (pictures.pixels, pictures.sizes, pictures.lines, origins, ways, colours)]
@@ -44,11 +44,11 @@ def sweep(
     given = [t.contiguous() for t in (*pictures, origins, ways, colours, depths)]
     if native is None or any(t.dtype != torch.float32 or t.is_cuda for t in given):
         return sweep_reference(pictures, origins, ways, colours, depths, tolerance)
-    index, cost = torch.empty(len(ways), dtype=torch.int64), torch.empty(len(ways))
+    index, agreement = torch.empty(len(ways), dtype=torch.int64), torch.empty(len(ways))
     shape = [*pictures.pixels.shape[:3], len(depths)]
     at = [t.data_ptr() for t in given]
-    native.sweep(at, shape, len(ways), tolerance, index.data_ptr(), cost.data_ptr(), num_threads())
-    return index, cost
+    native.sweep(at, shape, len(ways), tolerance, index.data_ptr(), agreement.data_ptr(), num_threads())
+    return index, agreement
 
 
 def sweep_reference(
@@ -56,7 +56,7 @@ def sweep_reference(
 ) -> tuple[Tensor, Tensor]:
     """``sweep`` in torch, view by view, in the dtype and on the device of the pictures."""
     points = origins[:, None] + depths[None, :, None] * ways[:, None]  # [N, D, 3]
-    total, count = points.new_zeros(2, *points.shape[:2])
+    total = points.new_zeros(points.shape[:2])
     for pixels, (W, H), line in zip(*pictures, strict=True):
         seen = points @ line[:, :3].T + line[:, 3]
         x, y = seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2]
@@ -65,8 +65,6 @@ def sweep_reference(
         own = pixels[: int(H), : int(W)].permute(2, 0, 1)[None]
         there = torch.nn.functional.grid_sample(own, at[None], padding_mode="border", align_corners=False)[0]
         off = (there - colours.T[:, :, None]).abs().sum(0) / tolerance
-        total += off.clamp(max=1) * inside
-        count += inside
-    mean = torch.where(count > 0, total / count.clamp_min(1), 1)
-    cost, index = mean.min(1)
-    return torch.where(cost < 1, index, 0), cost
+        total += (1 - off).clamp(min=0) * inside
+    agreement, index = (total / len(pictures.pixels)).max(1)
+    return index, agreement
