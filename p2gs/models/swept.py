@@ -8,7 +8,7 @@ sharper (docs/measured.md#where-single-states-start). Not in the paper.
 from __future__ import annotations
 
 import math
-from typing import Sequence
+from typing import NamedTuple, Sequence
 
 import torch
 from torch import Tensor
@@ -16,11 +16,11 @@ from torch import Tensor
 from p2gs.data.box import mask_bounds
 from p2gs.data.images import premultiply, resize_area
 from p2gs.ops.rays import camera_rays
-from p2gs.ops.sweep import Pictures, sweep
+from p2gs.ops.sweep import Pictures, agreement
 from p2gs.types import Camera, View
 
-SIZE = 64  # pixels, long edge of the object in a picture: larger pixels average the noise of a dim inside away
-EVERY = 2  # one ray for so many pixels, each way
+SIZES = (64, 128, 32)  # pixels, long edge of the object: small ones tell places, large ones have less noise
+EVERY = 2  # one ray for so many pixels of the first size, each way
 TOLERANCE = 0.05  # sum over colour and alpha, 0 to 1 each: a few times the noise of such a pixel
 BESIDE = 2  # steps of depth within which two views mean one place
 
@@ -28,44 +28,59 @@ BESIDE = 2  # steps of depth within which two views mean one place
 def swept_points(views: Sequence[View], box: Tensor) -> tuple[Tensor, Tensor]:
     """Points [N, 3] with colours [N, 3] in 0..1 where rays of the photographs meet what all of them agree on.
 
-    box [2, 3]: of the object, lowest and highest corner; rays are followed through it in steps of a pixel's size. A point is left out where rays of more
-    views go on through it than end at it.
+    box [2, 3]: of the object, lowest and highest corner; rays are followed through it in steps of a pixel's size. A
+    point is left out where rays of more views go on through it than end at it.
     """
     edges = [max(x1 - x0, y1 - y0) / max(v.alpha.shape) for v in views for x0, y0, x1, y1 in [mask_bounds(v.alpha)]]
-    long_edge = SIZE / float(torch.tensor(edges).median())
-    small = [_small(v, min(1.0, long_edge / max(v.alpha.shape))) for v in views]
-    pictures, cameras = _stack(small), [c for _, c in small]
+    share = float(torch.tensor(edges).median())
+    scales = [_scaled(views, size / share) for size in SIZES]
     corners = torch.cartesian_prod(*box.T)
     maps, points, colours = [], [], []
-    for v, camera in enumerate(cameras):
-        rows, cols = _looked_at(pictures.pixels[v])
-        ways = camera_rays(camera)[rows, cols] @ camera.viewmat[:3, :3]
-        depths = _depths(camera, corners)
-        colour = pictures.pixels[v, rows, cols]
-        index, _ = sweep(pictures, camera.position.expand(len(ways), 3), ways, colour, depths, TOLERANCE)
-        points.append(camera.position + depths[index, None] * ways)
-        colours.append(colour[:, :3] / colour[:, 3:])
-        maps.append((_depth_map(camera, rows, cols, depths[index]), BESIDE * float(depths[1] - depths[0])))
+    for v, camera in enumerate(scales[0].cameras):
+        rows, cols = _looked_at(scales[0].pictures.pixels[v])
+        ways, depths = camera_rays(camera)[rows, cols] @ camera.viewmat[:3, :3], _depths(camera, corners)
+        origins = camera.position.expand(len(ways), 3)
+        shown = [_look_up(scale, v, (cols + 0.5) / camera.width, (rows + 0.5) / camera.height) for scale in scales]
+        agreed = sum(
+            agreement(s.pictures, origins, ways, c, depths, TOLERANCE) for s, c in zip(scales, shown, strict=True)
+        )
+        depth = depths[agreed.argmax(1)]
+        points.append(camera.position + depth[:, None] * ways)
+        colours.append(shown[0][:, :3] / shown[0][:, 3:])
+        maps.append((_depth_map(camera, rows, cols, depth), BESIDE * float(depths[1] - depths[0])))
     owner, found = torch.cat([torch.full((len(p),), v) for v, p in enumerate(points)]), torch.cat(points)
-    kept = ((found >= box[0]) & (found <= box[1])).all(1) & _agreed(found, owner, cameras, maps)
+    kept = ((found >= box[0]) & (found <= box[1])).all(1) & _agreed(found, owner, scales[0].cameras, maps)
     return found[kept], torch.cat(colours)[kept]
 
 
-def _small(view: View, factor: float) -> tuple[Tensor, Camera]:
-    """The photograph scaled down, premultiplied colour and alpha [H, W, 4] in 0..1, with its camera."""
-    width, height = (max(EVERY, round(x * factor)) for x in (view.camera.width, view.camera.height))
-    pixels = resize_area(premultiply(view.image.numpy(), view.alpha.numpy()), width, height)
-    return torch.from_numpy(pixels) / 255, view.camera.scaled(width, height)
+class _Scaled(NamedTuple):
+    """Photographs of one scale, premultiplied colour and alpha in 0..1, with their cameras."""
+
+    pictures: Pictures
+    cameras: list[Camera]
 
 
-def _stack(small: Sequence[tuple[Tensor, Camera]]) -> Pictures:
-    """Photographs with their cameras as one tensor, as large as the largest."""
-    sizes = [(c.width, c.height) for _, c in small]
-    pixels = torch.zeros(len(small), max(h for _, h in sizes), max(w for w, _ in sizes), 4)
-    for v, (picture, (width, height)) in enumerate(zip([p for p, _ in small], sizes, strict=True)):
-        pixels[v, :height, :width] = picture
-    lines = torch.stack([c.K @ c.viewmat[:3] for _, c in small])
-    return Pictures(pixels, torch.tensor(sizes, dtype=torch.float32), lines)
+def _scaled(views: Sequence[View], long_edge: float) -> _Scaled:
+    """The photographs scaled down to a long edge, none up, as one tensor as large as the largest."""
+    cameras, small = [], []
+    for view in views:
+        camera, share = view.camera, min(1.0, long_edge / max(view.alpha.shape))
+        cameras.append(camera.scaled(*(max(EVERY, round(x * share)) for x in (camera.width, camera.height))))
+        pixels = premultiply(view.image.numpy(), view.alpha.numpy())
+        small.append(torch.from_numpy(resize_area(pixels, cameras[-1].width, cameras[-1].height)) / 255)
+    stacked = torch.zeros(len(small), max(len(p) for p in small), max(p.shape[1] for p in small), 4)
+    for to, picture in zip(stacked, small, strict=True):
+        to[: len(picture), : picture.shape[1]] = picture
+    sizes = torch.tensor([[c.width, c.height] for c in cameras], dtype=torch.float32)
+    return _Scaled(Pictures(stacked, sizes, torch.stack([c.K @ c.viewmat[:3] for c in cameras])), cameras)
+
+
+def _look_up(scale: _Scaled, view: int, x: Tensor, y: Tensor) -> Tensor:
+    """Colour and alpha [N, 4] of a photograph at places [N] across and down it, 0 to 1."""
+    width, height = scale.cameras[view].width, scale.cameras[view].height
+    own = scale.pictures.pixels[view, :height, :width].permute(2, 0, 1)[None]
+    at = torch.stack([2 * x - 1, 2 * y - 1], -1)[None, None]
+    return torch.nn.functional.grid_sample(own, at, padding_mode="border", align_corners=False)[0, :, 0].T
 
 
 def _looked_at(pixels: Tensor) -> tuple[Tensor, Tensor]:

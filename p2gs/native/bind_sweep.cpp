@@ -10,15 +10,15 @@ namespace p2gs {
 void bind_sweep(nb::module_& m) {
     m.def(
         "sweep",
-        [](const std::array<Address, 7>& at, const std::array<int64_t, 4>& shape, int64_t n, float tolerance, Address best, Address agreement,
+        [](const std::array<Address, 7>& at, const std::array<int64_t, 4>& shape, int64_t n, float tolerance, Address out,
            int threads) {
             const Sweep args{pointer<const float>(at[0]), pointer<const float>(at[1]), pointer<const float>(at[2]),
                              pointer<const float>(at[3]), pointer<const float>(at[4]), pointer<const float>(at[5]), pointer<const float>(at[6]),
                              shape[0], shape[1], shape[2], shape[3], tolerance};
-            sweep(args, n, pointer<int64_t>(best), pointer<float>(agreement), threads);
+            sweep(args, n, pointer<float>(out), threads);
         },
-        "addresses (pictures [V, H, W, 4], sizes [V, 2], lines [V, 3, 4], origins, ways, colours, depths), (V, H, W, steps), n, tolerance; best [n] int64, "
-        "agreement [n]: the depth at which the views agree best with a ray's colour, and how well in the mean.");
+        "addresses (pictures [V, H, W, 4], sizes [V, 2], lines [V, 3, 4], origins, ways, colours, depths), (V, H, W, steps), n, tolerance; out [n, steps]: how well the views "
+        "agree with a ray's colour at each depth, 0 to 1.");
 }
 
 }  // namespace p2gs

@@ -13,15 +13,13 @@ struct Sweep {
     float tolerance;
 };
 
-constexpr int64_t kSweepRays = 32;  // at a time: neighbours look at the same lines of a picture, which so stay in the cache
-
 struct SweepKernels {
-    // Rays [begin, end), at most kSweepRays: agreement summed over the views, [kSweepRays][steps], zero before.
+    // Rays [begin, end): agreement summed over the views, added to sum [n, steps].
     void (*look)(const Sweep&, int64_t begin, int64_t end, float* sum);
 };
 
-// best [n]: the step at which the views agree best with the ray's colour, the first of equal ones; agreement [n]: their mean there, 0 to 1,
-// those that do not contain the point counting as 0. The same bits for any number of threads.
-void sweep(const Sweep& args, int64_t n, int64_t* best, float* agreement, int threads);
+// out [n, steps]: how well the views agree with the ray's colour at each step, 0 to 1 in the mean, those that do not contain the point
+// counting as 0. The same bits for any number of threads.
+void sweep(const Sweep& args, int64_t n, float* out, int threads);
 
 }  // namespace p2gs

@@ -1,4 +1,4 @@
-"""Depth along rays by all photographs at once: where most of them show one colour, a surface is.
+"""How well all photographs agree along rays: where most of them show the ray's colour, a surface is.
 
 Plane sweeping (Collins 1996, https://doi.org/10.1109/CVPR.1996.517097) with every view instead of a few neighbours, and
 bounded votes (as in Vogiatzis et al. 2007, https://doi.org/10.1109/TPAMI.2007.70712): a view from which the surface is
@@ -25,36 +25,34 @@ class Pictures(NamedTuple):
 
 
 @torch.no_grad()
-def sweep(
+def agreement(
     pictures: Pictures, origins: Tensor, ways: Tensor, colours: Tensor, depths: Tensor, tolerance: float
-) -> tuple[Tensor, Tensor]:
-    """Of the points origin + depth * way of each ray the one whose colour the views agree on best.
+) -> Tensor:
+    """How well the views agree with each ray's colour at the points origin + depth * way, [N, D].
 
     origins, ways [N, 3]; colours [N, 4] of the rays; depths [D]; all float32. tolerance: sum over the channels of the
-    difference in colour at which a view does not agree at all.
-    Returns (index into depths [N] int64, the first of equal ones; how well [N] the views agree there, 0 to 1 in the
-    mean, those that do not contain the point 0). Raises ValueError on shapes that do not belong together.
+    difference in colour at which a view does not agree at all; 0 to 1 in the mean of the views, those that do not
+    contain the point counting as 0. Raises ValueError on shapes that do not belong together.
     """
     V = len(pictures.pixels)
     shapes = [tuple(t.shape) for t in (pictures.pixels, pictures.sizes, pictures.lines, origins, ways, colours)]
     if shapes[0][3:] != (4,) or shapes[1:3] != [(V, 2), (V, 3, 4)]:
-        raise ValueError(f"sweep wants pixels [V, H, W, 4], sizes [V, 2], lines [V, 3, 4], got {shapes[:3]}")
+        raise ValueError(f"agreement wants pixels [V, H, W, 4], sizes [V, 2], lines [V, 3, 4], got {shapes[:3]}")
     if shapes[3:] != [(len(ways), 3), (len(ways), 3), (len(ways), 4)]:
-        raise ValueError(f"sweep wants origins and ways [N, 3], colours [N, 4], got {shapes[3:]}")
+        raise ValueError(f"agreement wants origins and ways [N, 3], colours [N, 4], got {shapes[3:]}")
     given = [t.contiguous() for t in (*pictures, origins, ways, colours, depths)]
     if native is None or any(t.dtype != torch.float32 or t.is_cuda for t in given):
-        return sweep_reference(pictures, origins, ways, colours, depths, tolerance)
-    index, agreement = torch.empty(len(ways), dtype=torch.int64), torch.empty(len(ways))
+        return agreement_reference(pictures, origins, ways, colours, depths, tolerance)
+    out = torch.empty(len(ways), len(depths))
     shape = [*pictures.pixels.shape[:3], len(depths)]
-    at = [t.data_ptr() for t in given]
-    native.sweep(at, shape, len(ways), tolerance, index.data_ptr(), agreement.data_ptr(), num_threads())
-    return index, agreement
+    native.sweep([t.data_ptr() for t in given], shape, len(ways), tolerance, out.data_ptr(), num_threads())
+    return out
 
 
-def sweep_reference(
+def agreement_reference(
     pictures: Pictures, origins: Tensor, ways: Tensor, colours: Tensor, depths: Tensor, tolerance: float
-) -> tuple[Tensor, Tensor]:
-    """``sweep`` in torch, view by view, in the dtype and on the device of the pictures."""
+) -> Tensor:
+    """``agreement`` in torch, view by view, in the dtype and on the device of the pictures."""
     points = origins[:, None] + depths[None, :, None] * ways[:, None]  # [N, D, 3]
     total = points.new_zeros(points.shape[:2])
     for pixels, (W, H), line in zip(*pictures, strict=True):
@@ -66,5 +64,4 @@ def sweep_reference(
         there = torch.nn.functional.grid_sample(own, at[None], padding_mode="border", align_corners=False)[0]
         off = (there - colours.T[:, :, None]).abs().sum(0) / tolerance
         total += (1 - off).clamp(min=0) * inside
-    agreement, index = (total / len(pictures.pixels)).max(1)
-    return index, agreement
+    return total / len(pictures.pixels)

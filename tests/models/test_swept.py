@@ -69,7 +69,9 @@ def test_points_lie_on_the_sides_within_and_without(views):
     assert float((off(points) < 0.05).float().mean()) > 0.9
     floor = (points[:, :2].abs() < 0.4).all(1)
     assert int(floor.sum()) > 50
-    assert float((points[floor, 2] < 0).float().mean()) > 0.9  # no lid at the rim, which is at 0.5; the floor is at -0.5
+    assert (
+        float((points[floor, 2] < 0).float().mean()) > 0.9
+    )  # no lid at the rim, which is at 0.5; the floor is at -0.5
     assert float((colours[floor] - 0.05).abs().median()) < 0.05  # as dark as the floor is
 
 
