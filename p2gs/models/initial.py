@@ -27,17 +27,18 @@ def initial_points(
 ) -> Start:
     """What a state starts from. counts: how many points where there is no depth, how many depth points.
 
-    init "auto": depth points where every training view has depth, else points on which the photographs agree
-    (``swept_points``), and random ones where these are too few. "random": random ones alone.
+    init "auto": depth points where every training view has depth, else random ones. "agreed": depth points there, too,
+    else points on which the photographs agree (``swept_points``), and random ones where these are too few. "random":
+    random ones alone.
     """
     views, count = scene.select(state=state, split="train"), counts[0]
-    if init == "auto" and scene.has_depth:
+    if init != "random" and scene.has_depth:
         points, colours = depth_points(views, counts[1], generator)
         if len(points) > 100:
             return Start(points, colours, torch.ones(len(points), dtype=torch.bool))
     assert scene.box is not None  # every scene that is trained on has one
     points, colours = torch.zeros(2, 0, 3)
-    if init == "auto":
+    if init == "agreed":
         points, colours = swept_points(views, scene.box)
         chosen = torch.randperm(len(points), generator=generator)[:count]
         points, colours = points[chosen], colours[chosen]

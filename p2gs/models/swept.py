@@ -1,8 +1,8 @@
-"""Where a state without depth starts: points on which its photographs agree.
+"""Where a state without depth may start: points on which its photographs agree.
 
 From faint random points training closes dim openings with lids: what is in front becomes opaque first, and a lid
-explains a dim inside nearly as well as the inside does. Begun on the inside it stays there, and its pictures are
-sharper (docs/measured.md#where-single-states-start). Not in the paper.
+explains a dim inside nearly as well as the inside does. Begun on the inside most of it stays there, and its pictures
+are sharper (docs/measured.md#starting-where-photographs-agree). Not in the paper.
 """
 
 from __future__ import annotations

@@ -29,15 +29,16 @@ def wall_scene(distance: float = 3.0) -> TwoStateScene:
     return TwoStateScene("wall", tuple(views), box=torch.tensor([[-1.5] * 3, [1.5] * 3]))
 
 
-def test_depth_points_lie_on_what_was_measured():
+@pytest.mark.parametrize("init", ["auto", "agreed"])
+def test_depth_points_lie_on_what_was_measured(init):
     scene = wall_scene()
-    start = initial_points(scene, 0, (50, 300), "auto", torch.Generator().manual_seed(1))
+    start = initial_points(scene, 0, (50, 300), init, torch.Generator().manual_seed(1))
     assert bool(start.known.all()) and start.points.shape == start.colours.shape == (300, 3)
     assert float(start.points[:, 2].abs().max()) < 1e-5  # the wall is the plane z = 0 of the world
     assert float(start.colours.std()) > 0.2
 
 
-@pytest.mark.parametrize("init, depth", [("random", True), ("random", False)])
+@pytest.mark.parametrize("init, depth", [("random", True), ("auto", False)])
 def test_random_points_where_depth_is_not_wanted_or_not_there(init, depth):
     scene = wall_scene()
     if not depth:

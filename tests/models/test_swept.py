@@ -95,10 +95,10 @@ def test_photographs_of_several_sizes_are_compared(views):
 
 def test_a_state_starts_on_them_and_on_random_points_where_they_are_too_few(views):
     scene = TwoStateScene("box", tuple(views), box=AROUND)
-    start = initial_points(scene, 0, (500, 0), "auto", torch.Generator().manual_seed(1))
+    start = initial_points(scene, 0, (500, 0), "agreed", torch.Generator().manual_seed(1))
     assert len(start.points) == 500 and bool(start.known.all())
     found = len(swept_points(views, AROUND)[0])
-    start = initial_points(scene, 0, (found + 100, 0), "auto", torch.Generator().manual_seed(1))
+    start = initial_points(scene, 0, (found + 100, 0), "agreed", torch.Generator().manual_seed(1))
     assert start.known.sum() == found and len(start.points) == found + 100
     assert torch.equal(start.colours[~start.known], torch.full((100, 3), 0.5))
 
