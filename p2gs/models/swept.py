@@ -41,9 +41,9 @@ def swept_points(views: Sequence[View], box: Tensor) -> tuple[Tensor, Tensor]:
         ways, depths = camera_rays(camera)[rows, cols] @ camera.viewmat[:3, :3], _depths(camera, corners)
         origins = camera.position.expand(len(ways), 3)
         shown = [_look_up(scale, v, (cols + 0.5) / camera.width, (rows + 0.5) / camera.height) for scale in scales]
-        agreed = sum(
-            agreement(s.pictures, origins, ways, c, depths, TOLERANCE) for s, c in zip(scales, shown, strict=True)
-        )
+        agreed = torch.zeros(len(ways), len(depths))
+        for scale, colour in zip(scales, shown, strict=True):
+            agreed += agreement(scale.pictures, origins, ways, colour, depths, TOLERANCE)
         depth = depths[agreed.argmax(1)]
         points.append(camera.position + depth[:, None] * ways)
         colours.append(shown[0][:, :3] / shown[0][:, 3:])
@@ -92,7 +92,7 @@ def _looked_at(pixels: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _depths(camera: Camera, corners: Tensor) -> Tensor:
-    """Depths [D] from the nearest to the farthest corner [8, 3] of a box, as far apart as a pixel is wide in between."""
+    """Depths [D] from the nearest to the farthest corner [8, 3] of a box, as far apart as a pixel is wide half way."""
     z = corners @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
     near, far = float(z.min().clamp_min(1e-3 * z.max())), float(z.max())
     pixel = (near + far) / 2 / float(camera.K[[0, 1], [0, 1]].max())
