@@ -71,10 +71,9 @@ class SingleStateConfig(ImageConfig):
     steps: paper 30,000. initial_gaussians: how many where there is no depth; depth_gaussians: where there is.
     sh_degree: 0-3. sh_every: steps until the next degree is switched on. init: "auto" starts on depth points where the
     scene has depth, "agreed" elsewhere on points on which its photographs agree, else, and with "random", anywhere in
-    the silhouettes.
-    initial_opacity: of random points, low, so that concavities stay open until the images fill them; depth_opacity: of
-    points on surfaces. min_visible: Gaussians of which no training view sees this share are left out at the end:
-    nothing formed them (0 = keep all). forgive: errors of single photographs.
+    the silhouettes. initial_opacity: of random points, low, so that concavities stay open until the images fill them;
+    depth_opacity: of points on surfaces. min_visible: Gaussians of which no training view sees this share are left out
+    at the end: nothing formed them (0 = keep all). forgive: errors of single photographs.
     """
 
     steps: int = 6000

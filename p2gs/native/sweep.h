@@ -1,12 +1,13 @@
-// Depth along rays by how well all photographs agree there (p2gs/ops/sweep.py).
+// How well all photographs agree along rays (p2gs/ops/sweep.py).
 #pragma once
 
 #include <cstdint>
 
 namespace p2gs {
 
-// pictures [views, height, width, 4], of which the first sizes [views, 2] (width, height) pixels are a view's; lines [views, 3, 4]: world -> pixel, times depth; rays: origins and ways [n, 3], colours [n, 4];
-// depths [steps]: points are origin + depth * way. tolerance: of the sum over the four channels, at which a view does not agree at all.
+// pictures [views, height, width, 4], of which the first sizes [views, 2] (width, height) pixels are a view's; lines [views, 3, 4]:
+// world -> pixel, times depth; rays: origins and ways [n, 3], colours [n, 4]; depths [steps]: points are origin + depth * way.
+// tolerance: of the sum over the four channels, at which a view does not agree at all.
 struct Sweep {
     const float *pictures, *sizes, *lines, *origins, *ways, *colours, *depths;
     int64_t views, height, width, steps;
