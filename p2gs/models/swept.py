@@ -8,7 +8,7 @@ are sharper (docs/measured.md#starting-where-photographs-agree). Not in the pape
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Sequence
+from typing import Sequence
 
 import torch
 from torch import Tensor
@@ -33,52 +33,52 @@ def swept_points(views: Sequence[View], box: Tensor) -> tuple[Tensor, Tensor]:
     """
     edges = [max(x1 - x0, y1 - y0) / max(v.alpha.shape) for v in views for x0, y0, x1, y1 in [mask_bounds(v.alpha)]]
     share = float(torch.tensor(edges).median())
-    scales = [_scaled(views, size / share) for size in SIZES]
+    scales, cameras = _scaled(views, [size / share for size in SIZES])
     corners = torch.cartesian_prod(*box.T)
     maps, points, colours = [], [], []
-    for v, camera in enumerate(scales[0].cameras):
-        rows, cols = _looked_at(scales[0].pictures.pixels[v])
+    for v, camera in enumerate(cameras):
+        rows, cols = _looked_at(scales[0].pixels[v])
         ways, depths = camera_rays(camera)[rows, cols] @ camera.viewmat[:3, :3], _depths(camera, corners)
-        origins = camera.position.expand(len(ways), 3)
+        eyes = camera.position.expand(len(ways), 3)
         shown = [_look_up(scale, v, (cols + 0.5) / camera.width, (rows + 0.5) / camera.height) for scale in scales]
         agreed = torch.zeros(len(ways), len(depths))
         for scale, colour in zip(scales, shown, strict=True):
-            agreed += agreement(scale.pictures, origins, ways, colour, depths, TOLERANCE)
+            agreed += agreement(scale, eyes, ways, colour, depths, TOLERANCE)
         depth = depths[agreed.argmax(1)]
-        points.append(camera.position + depth[:, None] * ways)
+        points.append(eyes + depth[:, None] * ways)
         colours.append(shown[0][:, :3] / shown[0][:, 3:])
         maps.append((_depth_map(camera, rows, cols, depth), BESIDE * float(depths[1] - depths[0])))
     owner, found = torch.cat([torch.full((len(p),), v) for v, p in enumerate(points)]), torch.cat(points)
-    kept = ((found >= box[0]) & (found <= box[1])).all(1) & _agreed(found, owner, scales[0].cameras, maps)
+    kept = ((found >= box[0]) & (found <= box[1])).all(1) & _agreed(found, owner, cameras, maps)
     return found[kept], torch.cat(colours)[kept]
 
 
-class _Scaled(NamedTuple):
-    """Photographs of one scale, premultiplied colour and alpha in 0..1, with their cameras."""
-
-    pictures: Pictures
-    cameras: list[Camera]
-
-
-def _scaled(views: Sequence[View], long_edge: float) -> _Scaled:
-    """The photographs scaled down to a long edge, none up, as one tensor as large as the largest."""
-    cameras, small = [], []
+def _scaled(views: Sequence[View], long_edges: Sequence[float]) -> tuple[list[Pictures], list[Camera]]:
+    """The photographs, premultiplied colour and alpha in 0..1, scaled down to each of the long edges, none up; the
+    cameras of the first."""
+    cameras, small = [[] for _ in long_edges], [[] for _ in long_edges]
     for view in views:
-        camera, share = view.camera, min(1.0, long_edge / max(view.alpha.shape))
-        cameras.append(camera.scaled(*(max(EVERY, round(x * share)) for x in (camera.width, camera.height))))
         pixels = premultiply(view.image.numpy(), view.alpha.numpy())
-        small.append(torch.from_numpy(resize_area(pixels, cameras[-1].width, cameras[-1].height)) / 255)
-    stacked = torch.zeros(len(small), max(len(p) for p in small), max(p.shape[1] for p in small), 4)
-    for to, picture in zip(stacked, small, strict=True):
+        for long_edge, known, shown in zip(long_edges, cameras, small, strict=True):
+            camera, share = view.camera, min(1.0, long_edge / max(view.alpha.shape))
+            known.append(camera.scaled(*(max(EVERY, round(x * share)) for x in (camera.width, camera.height))))
+            shown.append(torch.from_numpy(resize_area(pixels, known[-1].width, known[-1].height)) / 255)
+    return [_stacked(shown, known) for shown, known in zip(small, cameras, strict=True)], cameras[0]
+
+
+def _stacked(shown: Sequence[Tensor], cameras: Sequence[Camera]) -> Pictures:
+    """Photographs [H, W, 4], each of its camera's size, as one tensor as large as the largest."""
+    sizes = torch.tensor([[c.width, c.height] for c in cameras])
+    pixels = torch.zeros(len(shown), *sizes.amax(0).flip(0).tolist(), 4)
+    for to, picture in zip(pixels, shown, strict=True):
         to[: len(picture), : picture.shape[1]] = picture
-    sizes = torch.tensor([[c.width, c.height] for c in cameras], dtype=torch.float32)
-    return _Scaled(Pictures(stacked, sizes, torch.stack([c.K @ c.viewmat[:3] for c in cameras])), cameras)
+    return Pictures(pixels, sizes.float(), torch.stack([c.K @ c.viewmat[:3] for c in cameras]))
 
 
-def _look_up(scale: _Scaled, view: int, x: Tensor, y: Tensor) -> Tensor:
+def _look_up(pictures: Pictures, view: int, x: Tensor, y: Tensor) -> Tensor:
     """Colour and alpha [N, 4] of a photograph at places [N] across and down it, 0 to 1."""
-    width, height = scale.cameras[view].width, scale.cameras[view].height
-    own = scale.pictures.pixels[view, :height, :width].permute(2, 0, 1)[None]
+    width, height = pictures.sizes[view].long().tolist()
+    own = pictures.pixels[view, :height, :width].permute(2, 0, 1)[None]
     at = torch.stack([2 * x - 1, 2 * y - 1], -1)[None, None]
     return torch.nn.functional.grid_sample(own, at, padding_mode="border", align_corners=False)[0, :, 0].T
 

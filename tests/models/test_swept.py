@@ -5,9 +5,11 @@ import math
 import pytest
 import torch
 
+from p2gs.gaussians.views import look_at
 from p2gs.models.initial import initial_points
 from p2gs.models.swept import swept_points
-from p2gs.types import Camera, TwoStateScene, View
+from p2gs.ops.rays import camera_rays
+from p2gs.types import TwoStateScene, View
 
 SIZE = 96
 BOX = torch.tensor([[-0.6, -0.6, -0.5], [0.6, 0.6, 0.5]])  # open at the top, z = 0.5
@@ -32,21 +34,14 @@ def photograph(number: int, count: int, noise: float) -> View:
     """From a spiral above the box, 2.5 from its middle."""
     turn, up = 2.4 * number, math.radians(15 + 60 * number / count)
     eye = 2.5 * torch.tensor([math.cos(turn) * math.cos(up), math.sin(turn) * math.cos(up), math.sin(up)])
-    forward = -eye / eye.norm()
-    right = torch.linalg.cross(forward, torch.tensor([0.0, 0, 1]))
-    right = right / right.norm()
-    R = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    pose = torch.eye(4)
-    pose[:3, :3], pose[:3, 3] = R, -R @ eye
-    K = torch.tensor([[1.3 * SIZE, 0, SIZE / 2], [0, 1.3 * SIZE, SIZE / 2], [0, 0, 1]])
-    y, x = torch.meshgrid(*[torch.arange(SIZE) + 0.5 - SIZE / 2] * 2, indexing="ij")
-    ways = torch.stack([x / K[0, 0], y / K[1, 1], torch.ones_like(x)], -1) @ R
+    camera = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0, 1]), SIZE, SIZE, 1.3 * SIZE)
+    ways = camera_rays(camera) @ camera.viewmat[:3, :3]
     t, colour = hit(eye, ways)
     g = torch.Generator().manual_seed(number)
     colour = (colour + noise * torch.randn(colour.shape, generator=g)).clamp(0, 1)
     alpha = torch.isfinite(t)
     return View(
-        f"{number:02d}", 0, "train", Camera(pose, K, SIZE, SIZE), (colour * 255).round().byte() * alpha[..., None],
+        f"{number:02d}", 0, "train", camera, (colour * 255).round().byte() * alpha[..., None],
         alpha.byte() * 255,
     )  # fmt: skip
 
