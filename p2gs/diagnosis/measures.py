@@ -193,11 +193,13 @@ def evidence_points(motions: PartMotions, state: StateGaussians) -> tuple[Tensor
 
 def discovery(motions: PartMotions, unit: float) -> dict:
     """Explanations that were compared, with their image losses; parts that were dropped or merged, with the reason;
-    what was tried when the best was reconsidered; which parts beside each other were asked whether they are one."""
+    which parts of the others the best took over; what was tried when it was reconsidered; which parts beside each other
+    were asked whether they are one."""
     told = motions.diagnostics
     return {
         "chosen": told.get("explanation"),
         "explanations": told.get("explanations", []),
+        "fused": told.get("fused", []),
         "reconsidered": told.get("reconsidered", []),
         "candidates": told.get("candidates", []),
         "seamless": told.get("seamless", []),

@@ -25,6 +25,7 @@ from p2gs.parts.askew import lay_axes
 from p2gs.parts.bodies import Surfaces, looked_through, one_part_a_body
 from p2gs.parts.expand import expand
 from p2gs.parts.fronts import part_fronts
+from p2gs.parts.fuse import fuse
 from p2gs.parts.options import PartMotionsConfig
 from p2gs.parts.part_choices import better, settle_types, simplify
 from p2gs.parts.seams import join_seamless
@@ -61,9 +62,10 @@ def find_part_motions(
     found = discover(evidence[0], evidence[1], num_parts, config.search, seed, progress=report)
     judge = Judge(found, states, views, config.coarse, found.problem.stacks, further=config.part_penalty, **options)
     explanations, looks = _looked_at(judge, _explanations(found), config, say)
-    motions, compared = _compared(judge, explanations, config, say)
+    limit = (config.search.max_parts if num_parts == "auto" else num_parts) - 1
+    motions, compared = _compared(judge, explanations, limit, config, say)
     motions, expanded = expand(judge, motions)
-    limit, known = (config.search.max_parts if num_parts == "auto" else num_parts) - 1, len(motions)
+    known = len(motions)
     motions, improved = _improved(judge, motions, limit, config, say)
     if len(motions) > known:  # what came may be a piece of another
         motions, later = expand(judge, motions)
@@ -117,9 +119,9 @@ def _looked_at(judge: Judge, explanations: list, config: PartMotionsConfig, say)
     return [explanations[i] for i in order], looks
 
 
-def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
-    """The best explanation (``better``), refined and without parts that it is better without; which it was, and of each
-    the image loss and how much higher its energy is ("rank")."""
+def _compared(judge: Judge, explanations: list, limit: int, config: PartMotionsConfig, say) -> tuple[PartMotions, dict]:
+    """The best explanation (``better``), refined, without parts that it is better without and with those of the others
+    that it is better with; which it was, and of each the image loss and how much higher its energy is ("rank")."""
     if len(explanations) > 1:
         say(f"re-rendering {len(explanations)} explanations")
 
@@ -136,7 +138,8 @@ def _compared(judge: Judge, explanations: list, config: PartMotionsConfig, say) 
             chosen = number
     for one, motions in zip(tried, refined, strict=True):
         one["rank"] = judge.gain(refined[chosen], motions)
-    return refined[chosen], {"explanation": chosen, "explanations": tried}
+    motions, fused = fuse(judge, refined[chosen], refined, limit, config.same_motion)
+    return motions, {"explanation": chosen, "explanations": tried, "fused": fused}
 
 
 def _improved(
