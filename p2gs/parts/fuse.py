@@ -35,16 +35,18 @@ def fuse(
             for part in range(len(other))
             if not _known(judge, motions, other, part, same_motion)
         ]
-        if not tries:
-            break
         judge.seen(motions)  # once, and not in each thread
         gains = at_once(partial(judge.gain, than=motions), [tried for _, _, tried in tries])
-        gained, (number, part, best) = max(zip(gains, tries, strict=True), key=itemgetter(0))
-        told = {"change": "fused", "explanation": number, "part": part, "type": best.types[-1], "energy": -gained}
-        log.append({**told, "own_share": judge.own_share(best, motions)})
-        if not better(judge, best, motions):
+        for gained, (number, part, tried) in sorted(zip(gains, tries, strict=True), key=itemgetter(0), reverse=True):
+            told = {"change": "fused", "explanation": number, "part": part, "type": tried.types[-1], "energy": -gained}
+            log.append(told)
+            if gained > 0:
+                told["own_share"] = judge.own_share(tried, motions)
+            if gained > 0 and better(judge, tried, motions):
+                motions = judge.improved(tried)[2]
+                break
+        else:
             break
-        motions = judge.improved(best)[2]
     return motions, log
 
 

@@ -68,9 +68,19 @@ def test_the_part_that_lowers_the_energy_is_taken_and_one_that_is_there_is_not_a
 def test_nothing_is_taken_that_raises_the_energy_or_saves_little_in_its_own_pixels():
     start = chosen()
     motions, log = fuse(judge_by(lambda m: float(len(m))), start, [other()], 5, 0.04)
-    assert motions is start and log[0]["energy"] == 1.0
+    assert motions is start and log[0]["energy"] == 1.0 and "own_share" not in log[0]
     motions, log = fuse(judge_by(more_is_better, share=0.1), start, [other()], 5, 0.04)
     assert motions is start and log[0]["own_share"] == 0.1
+
+
+def test_where_the_part_of_least_energy_saves_little_the_next_one_is_asked():
+    judge = judge_by(lambda m: -float(m.transforms[-1].abs().max()))
+    judge.own_share = lambda tried, than: 0.1 if float(tried.transforms[-1].abs().max()) > 2 else 0.2
+    far = explanation([0.11, 3.0], [0, 0, 1, 1, 2, 2], [0, 2, 1, 1, 2, 0])
+    near = explanation([0.11, 2.0], [0, 0, 1, 1, 2, 2], [0, 2, 1, 1, 2, 0])
+    motions, log = fuse(judge, chosen(), [far, near], 2, 0.04)
+    assert [(told["explanation"], told["own_share"]) for told in log] == [(0, 0.1), (1, 0.2)]
+    assert float(motions.transforms[1, 1, 3]) == 2.0
 
 
 def test_there_are_no_more_parts_than_asked_for():
