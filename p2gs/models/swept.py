@@ -23,6 +23,7 @@ SIZES = (64, 128, 32)  # pixels, long edge of the object: small ones tell places
 EVERY = 2  # one ray for so many pixels of the first size, each way
 TOLERANCE = 0.05  # sum over colour and alpha, 0 to 1 each: a few times the noise of such a pixel
 BESIDE = 2  # steps of depth within which two views mean one place
+SHORT = 0.05  # share of the best votes by which a depth may fall short of them and be as good
 
 
 def swept_points(views: Sequence[View], box: Tensor) -> tuple[Tensor, Tensor]:
@@ -44,13 +45,23 @@ def swept_points(views: Sequence[View], box: Tensor) -> tuple[Tensor, Tensor]:
         agreed = torch.zeros(len(ways), len(depths))
         for scale, colour in zip(scales, shown, strict=True):
             agreed += agreement(scale, eyes, ways, colour, depths, TOLERANCE)
-        depth = depths[agreed.argmax(1)]
+        depth = depths[_nearest(agreed)]
         points.append(eyes + depth[:, None] * ways)
         colours.append(shown[0][:, :3] / shown[0][:, 3:])
         maps.append((_depth_map(camera, rows, cols, depth), BESIDE * float(depths[1] - depths[0])))
     owner, found = torch.cat([torch.full((len(p),), v) for v, p in enumerate(points)]), torch.cat(points)
     kept = ((found >= box[0]) & (found <= box[1])).all(1) & _agreed(found, owner, cameras, maps)
     return found[kept], torch.cat(colours)[kept]
+
+
+def _nearest(votes: Tensor) -> Tensor:
+    """Of the votes [N, D] for depths, the nearest depth's index [N] that is as good as the best (``SHORT``).
+
+    Behind a plain outer wall every photograph that sees the wall still sees it, a little shifted along itself: votes
+    stay about as good from the wall on into the body. Their best was too deep more often than not, and what starts
+    there lines the inside.
+    """
+    return (votes >= (1 - SHORT) * votes.amax(1, keepdim=True)).byte().argmax(1)
 
 
 def _scaled(views: Sequence[View], long_edges: Sequence[float]) -> tuple[list[Pictures], list[Camera]]:

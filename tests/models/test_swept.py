@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from p2gs.gaussians.views import look_at
+from p2gs.models import swept
 from p2gs.models.initial import initial_points
 from p2gs.models.swept import swept_points
 from p2gs.ops.rays import camera_rays
@@ -30,13 +31,23 @@ def hit(start: torch.Tensor, ways: torch.Tensor) -> tuple[torch.Tensor, torch.Te
     return t, torch.where(inside[..., None], shade.expand_as(pattern), pattern)
 
 
-def photograph(number: int, count: int, noise: float) -> View:
+def plain(start: torch.Tensor, ways: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """As ``hit``, of the box with a top and each side in one colour."""
+    low, high = ((side - start) / ways for side in BOX)
+    near, far = torch.minimum(low, high), torch.maximum(low, high).amin(-1)
+    t, axis = near.max(-1)
+    side = (ways.gather(-1, axis[..., None])[..., 0] > 0).float()
+    colour = torch.stack([0.8 - 0.15 * axis, 0.5 + 0.2 * side, 0.3 + 0.2 * axis], -1)
+    return torch.where(t < far, t, torch.inf), colour
+
+
+def photograph(number: int, count: int, noise: float, scene=hit) -> View:
     """From a spiral above the box, 2.5 from its middle."""
     turn, up = 2.4 * number, math.radians(15 + 60 * number / count)
     eye = 2.5 * torch.tensor([math.cos(turn) * math.cos(up), math.sin(turn) * math.cos(up), math.sin(up)])
     camera = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0, 1]), SIZE, SIZE, 1.3 * SIZE)
     ways = camera_rays(camera) @ camera.viewmat[:3, :3]
-    t, colour = hit(eye, ways)
+    t, colour = scene(eye, ways)
     g = torch.Generator().manual_seed(number)
     colour = (colour + noise * torch.randn(colour.shape, generator=g)).clamp(0, 1)
     alpha = torch.isfinite(t)
@@ -68,6 +79,20 @@ def test_points_lie_on_the_sides_within_and_without(views):
         float((points[floor, 2] < 0).float().mean()) > 0.9
     )  # no lid at the rim, which is at 0.5; the floor is at -0.5
     assert float((colours[floor] - 0.05).abs().median()) < 0.05  # as dark as the floor is
+
+
+def test_points_of_plain_sides_lie_no_deeper_than_these(monkeypatch):
+    pictures = [photograph(k, 24, 0.01, plain) for k in range(24)]
+
+    def far_inside() -> float:
+        points, _ = swept_points(pictures, AROUND)
+        depth = torch.minimum(points - BOX[0], BOX[1] - points).amin(1)
+        assert float((depth.abs() < 0.06).float().mean()) > 0.9
+        return float((depth > 0.06).float().mean())
+
+    nearest = far_inside()
+    monkeypatch.setattr(swept, "SHORT", 0.0)  # where most agree
+    assert nearest < 0.03 and far_inside() > 3 * nearest
 
 
 def test_colours_are_those_of_the_photographs_and_order_does_not_matter(views):
