@@ -89,17 +89,21 @@ def unconfirmed(
 ) -> tuple[Tensor, Tensor]:
     """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its
     views see, and farther than ``apart`` from surfaces of their own part (what hangs where a door shuts is not the
-    door's). And which of these are near another part's, [N] bool.
+    door's). Of the base, none that lies on a moving part in its own state, as the seams of a shut door's front do: a
+    lid has air on both sides. And which of these are near another part's, [N] bool.
 
     transforms [K-1, 4, 4] to the other state; labels [N], other_labels [M]: of both; stack: the other one's rendered
     depth."""
     at, solid = landed(g.means, labels, transforms), torch.sigmoid(other.opacity_logits) > SOLID
+    moving = g.means[(torch.sigmoid(g.opacity_logits) > SOLID) & (labels > 0)]
     own = torch.full((len(g),), torch.inf)
     for part in labels.unique().tolist():
         mine, theirs = (labels == part).nonzero().squeeze(1), other.means[solid & (other_labels == part)]
         if len(theirs):
             own[mine] = knn(theirs, at[mine], 1, False)[0][:, 0]
-    lids = out_of_sight(at, stack) & (own > apart)
+    lids, base = out_of_sight(at, stack) & (own > apart), (labels == 0).nonzero().squeeze(1)
+    if len(moving):
+        lids[base] &= knn(moving, g.means[base], 1, False)[0][:, 0] > apart
     return lids, lids & (knn(other.means[solid], at, 1, False)[0][:, 0] <= apart)
 
 
