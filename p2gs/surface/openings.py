@@ -89,22 +89,30 @@ def unconfirmed(
 ) -> tuple[Tensor, Tensor]:
     """Which Gaussians of one state the other one says nothing of, [N] bool: carried there they are behind what its
     views see, and farther than ``apart`` from surfaces of their own part (what hangs where a door shuts is not the
-    door's). Of the base, none that lies on a moving part in its own state, as the seams of a shut door's front do: a
-    lid has air on both sides. And which of these are near another part's, [N] bool.
+    door's). And which of these are near another part's, [N] bool.
 
     transforms [K-1, 4, 4] to the other state; labels [N], other_labels [M]: of both; stack: the other one's rendered
     depth."""
     at, solid = landed(g.means, labels, transforms), torch.sigmoid(other.opacity_logits) > SOLID
-    moving = g.means[(torch.sigmoid(g.opacity_logits) > SOLID) & (labels > 0)]
     own = torch.full((len(g),), torch.inf)
     for part in labels.unique().tolist():
         mine, theirs = (labels == part).nonzero().squeeze(1), other.means[solid & (other_labels == part)]
         if len(theirs):
             own[mine] = knn(theirs, at[mine], 1, False)[0][:, 0]
-    lids, base = out_of_sight(at, stack) & (own > apart), (labels == 0).nonzero().squeeze(1)
-    if len(moving):
-        lids[base] &= knn(moving, g.means[base], 1, False)[0][:, 0] > apart
+    lids = out_of_sight(at, stack) & (own > apart)
     return lids, lids & (knn(other.means[solid], at, 1, False)[0][:, 0] <= apart)
+
+
+def on_parts(g: GaussianTensors, labels: Tensor, lids: Tensor, apart: float) -> Tensor:
+    """Labels [N], where ``lids`` [N] bool of the base that lie on a moving part in their own state, nearer than
+    ``apart``, are that part's: a lid has air on both sides, and these are seams of a shut front, or its haze. labels
+    [N]: as they were."""
+    moving = ((torch.sigmoid(g.opacity_logits) > SOLID) & (labels > 0)).nonzero().squeeze(1)
+    rows, given = (lids & (labels == 0)).nonzero().squeeze(1), labels.clone()
+    if len(moving) and len(rows):
+        distance, nearest = knn(g.means[moving], g.means[rows], 1, False)
+        given[rows] = torch.where(distance[:, 0] <= apart, labels[moving[nearest[:, 0]]], 0)
+    return given
 
 
 BASE, DOOR, DRAWER = range(3)
@@ -331,6 +339,9 @@ def open_up(
         for s in (0, 1)
     )
     lids, beside = zip(*found, strict=True)
+    labels = [on_parts(g[s], motions.labels[s], lids[s], config.apart) for s in (0, 1)]
+    lids = [of & (new == old) for of, new, old in zip(lids, labels, motions.labels, strict=True)]
+    motions = replace(motions, labels=labels)
     base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
     box = torch.quantile(
         torch.cat([x.means[k] for x, k in zip(g, solid, strict=True)]), torch.tensor([0.002, 0.998]), 0
@@ -342,7 +353,7 @@ def open_up(
         if int((lids[s] & solid[s]).sum()) < config.patch:
             continue
         kind = kinds(g[s], motions.labels[s], motions.types)
-        state = OneState(g[s], lids[s], beside[s], kind, views[s], config, backend, device)
+        state = OneState(g[s], lids[s], beside[s] & lids[s], kind, views[s], config, backend, device)
         chosen, backdrop = state.choose(state.backdrops(walls, stacks))
         counted[s] |= {"patches": state.count, "boards": backdrop.boards, "gave_way": int(chosen.sum())}
         if not chosen.any():
