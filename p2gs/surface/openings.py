@@ -323,7 +323,7 @@ def open_up(
     device="cpu",
 ) -> tuple[list[Opening], PartMotions, list[DepthStack], list[dict]]:
     """By state, which lids give way to the inner sides of the walls behind them; the motions with labels of these (the
-    base's), the depth of both states so opened, and what was counted, by state.
+    base's) and of what lies ``on_parts``, the depth of both states so opened, and what was counted, by state.
 
     views: ``TrainingViews`` by state; stacks: rendered depth of both states.
     """
