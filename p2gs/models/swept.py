@@ -58,7 +58,7 @@ def _nearest(votes: Tensor) -> Tensor:
     """Of the votes [N, D] for depths, the nearest depth's index [N] that is as good as the best (``SHORT``).
 
     Behind a plain outer wall every photograph that sees the wall still sees it, a little shifted along itself: votes
-    stay about as good from the wall on into the body. Their best lay behind the wall three times in ten, and what starts
+    stay about as good from the wall on into the body. Three times in ten their best lay behind it, and what starts
     there lines the inside.
     """
     return (votes >= (1 - SHORT) * votes.amax(1, keepdim=True)).byte().argmax(1)
