@@ -300,8 +300,7 @@ def apart(a: Tensor, b: Tensor, points: Tensor) -> tuple[float, float]:
     turn = se3.screw_parameters(se3.inverse(a.double()) @ b.double()).angle
     if not len(points):
         return 0.0, math.degrees(float(turn))
-    p = points.double()
-    return float((se3.apply(a.double(), p) - se3.apply(b.double(), p)).norm(dim=1).mean()), math.degrees(float(turn))
+    return float(se3.mean_gap(a.double(), b.double(), points.double())), math.degrees(float(turn))
 
 
 def joint_type(part: Part) -> str:

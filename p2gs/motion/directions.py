@@ -185,10 +185,10 @@ def has_own_axis(states: list[StateGaussians], motions: PartMotions, part: int, 
     points = states[0].gaussians.means[motions.labels[0] == part + 1].double()
     if kind == "prismatic" or not len(points):
         return not others
-    at, angle = se3.apply(T[part], points), se3.screw_parameters(T[part]).angle
+    angle = se3.screw_parameters(T[part]).angle
     for line in map(se3.screw_parameters, T[others]):
-        there = se3.apply(se3.from_screw(line.axis * torch.sign(line.axis @ axis), line.origin, angle), points)
-        if float((there - at).norm(dim=1).mean()) < LINE:
+        about = se3.from_screw(line.axis * torch.sign(line.axis @ axis), line.origin, angle)
+        if float(se3.mean_gap(about, T[part], points)) < LINE:
             return False
     return True
 

@@ -300,4 +300,4 @@ def parted(state: StateGaussians, labels: Tensor, part: int, forward: Tensor, ba
     points = state.gaussians.means[labels == part + 1].double()
     if not len(points):
         return 0.0
-    return float((se3.apply(forward[part], points) - se3.apply(backward[part], points)).norm(dim=1).mean())
+    return float(se3.mean_gap(forward[part], backward[part], points))

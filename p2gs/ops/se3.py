@@ -51,6 +51,12 @@ def apply(T: Tensor, points: Tensor) -> Tensor:
     return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
 
 
+def mean_gap(a: Tensor, b: Tensor, points: Tensor) -> Tensor:
+    """Mean distance [...] between where motions a and b [..., 4, 4] take the same points [..., N, 3]; batch shapes
+    broadcast. nan without points."""
+    return (apply(a, points) - apply(b, points)).norm(dim=-1).mean(-1)
+
+
 def _third(theta_sq: Tensor) -> Tensor:
     """(theta - sin(theta)) / theta^3 of theta^2."""
     small, low, theta = so3._split(theta_sq)

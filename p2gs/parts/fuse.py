@@ -18,15 +18,15 @@ from p2gs.gaussians.handover import PartMotions
 from p2gs.motion.refine_motions import Judge
 from p2gs.native import at_once
 from p2gs.ops import se3
-from p2gs.parts.part_choices import better
+from p2gs.parts.part_choices import further_axes
 
 
 def fuse(
     judge: Judge, motions: PartMotions, others: list[PartMotions], limit: int, same_motion: float
 ) -> tuple[PartMotions, list[dict]]:
-    """The motions with those parts of ``others``, up to ``limit`` parts, by which they are ``better``, refined; what
-    was tried. Parts that go as one of the motions does, by less than ``same_motion`` (internal units) of their own
-    points' mean path, are not asked."""
+    """The motions with those parts of ``others``, up to ``limit`` parts, by which they are better, as explanations are
+    compared (``part_choices.better``), refined; what was tried. Parts that go as one of the motions does, by less than
+    ``same_motion`` (internal units) of their own points' mean path, are not asked."""
     log: list[dict] = []
     while 0 < len(motions) < limit:
         tries = [
@@ -35,19 +35,28 @@ def fuse(
             for part in range(len(other))
             if not _known(judge, motions, other, part, same_motion)
         ]
-        judge.seen(motions)  # once, and not in each thread
-        gains = at_once(partial(judge.gain, than=motions), [tried for _, _, tried in tries])
-        for gained, (number, part, tried) in sorted(zip(gains, tries, strict=True), key=itemgetter(0), reverse=True):
-            told = {"change": "fused", "explanation": number, "part": part, "type": tried.types[-1], "energy": -gained}
-            log.append(told)
-            if gained > 0:
-                told["own_share"] = judge.own_share(tried, motions)
-            if gained > 0 and better(judge, tried, motions):
-                motions = judge.improved(tried)[2]
-                break
-        else:
+        taken = _taken(judge, motions, tries, log)
+        if taken is None:
             break
+        motions = judge.improved(taken)[2]
     return motions, log
+
+
+def _taken(
+    judge: Judge, motions: PartMotions, tries: list[tuple[int, int, PartMotions]], log: list[dict]
+) -> PartMotions | None:
+    """Of the tries (explanation, part, motions with it) the one of least energy that is better than ``motions``, None
+    where none is. log: told of each that was asked."""
+    judge.seen(motions)  # once, and not in each thread
+    gains = at_once(partial(judge.gain, than=motions), [tried for _, _, tried in tries])
+    for gained, (number, part, tried) in sorted(zip(gains, tries, strict=True), key=itemgetter(0), reverse=True):
+        told = {"change": "fused", "explanation": number, "part": part, "type": tried.types[-1], "energy": -gained}
+        log.append(told)
+        if gained > 0:
+            told["own_share"] = judge.own_share(tried, motions)
+            if told["own_share"] >= judge.further or further_axes(tried, motions) <= 0:
+                return tried
+    return None
 
 
 def with_part_of(motions: PartMotions, other: PartMotions, part: int) -> PartMotions:
@@ -66,6 +75,4 @@ def _known(judge: Judge, motions: PartMotions, other: PartMotions, part: int, sa
     points = judge.states[0].gaussians.means[other.labels[0] == part + 1].double()
     if not len(points):
         return True
-    there = se3.apply(other.transforms[part], points)
-    ways = [(se3.apply(T, points) - there).norm(dim=1).mean() for T in motions.transforms]
-    return float(torch.stack(ways).min()) < same_motion
+    return float(se3.mean_gap(motions.transforms, other.transforms[part], points).min()) < same_motion

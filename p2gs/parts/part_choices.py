@@ -153,8 +153,7 @@ def _reductions(states, motions: PartMotions, same_motion: float, joins: bool = 
                 if min(len(a), len(b)) < 5:
                     continue
                 ways = [se3.inverse(motions.transforms[k]) if back else motions.transforms[k] for k in (small, large)]
-                gap = se3.apply(ways[0], a) - se3.apply(ways[1], a)
-                if float(gap.norm(dim=1).mean()) < same_motion and _touch(a, b):
+                if float(se3.mean_gap(ways[0], ways[1], a)) < same_motion and _touch(a, b):
                     yield ("merge", small, large + 1), without_part(motions, small, large + 1)
                     break
     for i, small in enumerate(order):

@@ -107,7 +107,7 @@ def _turned_over(found: Discovery, states, motions: PartMotions) -> list[tuple[i
         for axis in torch.linalg.svd(points - middle, full_matrices=False)[2]:
             over = T @ se3.from_screw(axis, middle, math.pi)
             turn = se3.project_revolute(over)
-            if float((se3.apply(over, points) - se3.apply(turn, points)).norm(dim=1).mean()) < LINE:
+            if float(se3.mean_gap(over, turn, points)) < LINE:
                 out.append((k, relabelled(found, states, motions.with_motion(k, kind, turn))))
     return out
 

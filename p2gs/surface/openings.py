@@ -103,14 +103,14 @@ def unconfirmed(
     return lids, lids & (knn(other.means[solid], at, 1, False)[0][:, 0] <= apart)
 
 
-def on_parts(g: GaussianTensors, labels: Tensor, lids: Tensor, apart: float) -> Tensor:
-    """Labels [N], where ``lids`` [N] bool of the base that lie on a moving part in their own state, nearer than
-    ``apart``, are that part's: a lid has air on both sides, and these are seams of a shut front, or its haze. labels
-    [N]: as they were."""
-    moving = ((torch.sigmoid(g.opacity_logits) > SOLID) & (labels > 0)).nonzero().squeeze(1)
+def on_parts(means: Tensor, labels: Tensor, lids: Tensor, solid: Tensor, apart: float) -> Tensor:
+    """Labels [N], where ``lids`` [N] bool of the base that lie on a moving part's ``solid`` [N] bool Gaussians in their
+    own state, nearer than ``apart``, are that part's: a lid has air on both sides, and these are seams of a shut front,
+    or its haze. means [N, 3]; labels [N]: as they were."""
+    moving = (solid & (labels > 0)).nonzero().squeeze(1)
     rows, given = (lids & (labels == 0)).nonzero().squeeze(1), labels.clone()
     if len(moving) and len(rows):
-        distance, nearest = knn(g.means[moving], g.means[rows], 1, False)
+        distance, nearest = knn(means[moving], means[rows], 1, False)
         given[rows] = torch.where(distance[:, 0] <= apart, labels[moving[nearest[:, 0]]], 0)
     return given
 
@@ -339,7 +339,7 @@ def open_up(
         for s in (0, 1)
     )
     lids, beside = zip(*found, strict=True)
-    labels = [on_parts(g[s], motions.labels[s], lids[s], config.apart) for s in (0, 1)]
+    labels = [on_parts(g[s].means, motions.labels[s], lids[s], solid[s], config.apart) for s in (0, 1)]
     lids = [of & (new == old) for of, new, old in zip(lids, labels, motions.labels, strict=True)]
     motions = replace(motions, labels=labels)
     base = [solid[s] & ~lids[s] & (motions.labels[s] == 0) for s in (0, 1)]
@@ -353,7 +353,7 @@ def open_up(
         if int((lids[s] & solid[s]).sum()) < config.patch:
             continue
         kind = kinds(g[s], motions.labels[s], motions.types)
-        state = OneState(g[s], lids[s], beside[s] & lids[s], kind, views[s], config, backend, device)
+        state = OneState(g[s], lids[s], beside[s], kind, views[s], config, backend, device)
         chosen, backdrop = state.choose(state.backdrops(walls, stacks))
         counted[s] |= {"patches": state.count, "boards": backdrop.boards, "gave_way": int(chosen.sum())}
         if not chosen.any():

@@ -141,3 +141,11 @@ def test_distances_and_orientation_are_kept():
         (moved[:, 1:] - moved[:, :-1]).norm(dim=-1), (points[1:] - points[:-1]).norm(dim=-1).expand(10, -1)
     )
     torch.testing.assert_close(torch.linalg.det(T[:, :3, :3]), torch.ones(10, dtype=F64))
+
+
+def test_the_mean_gap_is_that_of_the_points_one_by_one():
+    *many, one = se3.exp(twists(9, seed=7))
+    points = torch.randn(5, 3, generator=torch.Generator().manual_seed(8), dtype=F64)
+    naive = [sum(math.dist(T[:3, :3] @ p + T[:3, 3], one[:3, :3] @ p + one[:3, 3]) for p in points) / 5 for T in many]
+    torch.testing.assert_close(se3.mean_gap(torch.stack(many), one, points), torch.tensor(naive, dtype=F64))
+    assert float(se3.mean_gap(one, one, points)) == 0 and torch.isnan(se3.mean_gap(one, one, points[:0]))
