@@ -3,6 +3,8 @@ the Gaussians themselves."""
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -94,18 +96,24 @@ class DepthVariance(Loss):
     see. The foreground is where the photograph's alpha is above one half. The default weight falls from 30 to 10 over
     its span, in the units of an object of unit size. None where the render carries no squared depth
     (``RenderOutput.depth_sq``).
+
+    knee: spread (a standard deviation, internal units) from which on a ray counts ever less
+    (``ops.pixels.depth_spread``; None: all count alike). What it meets then is no fog but two surfaces, as at an
+    opening, and which of them is there the photographs are to say: alike, the front wins.
     """
 
     needs = frozenset({"depth_sq"})
     kind = "prior"
     weight: float = 30.0
     end_weight: float | None = 10.0
+    knee: float | None = None
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
         render, target = inputs.render, inputs.target
         if render is None or target is None or render.depth_sq is None:
             return None
-        return 2 * depth_spread(render.alpha, render.depth, render.depth_sq, target.alpha, render.depth_ref)
+        knee = math.inf if self.knee is None else self.knee
+        return 2 * depth_spread(render.alpha, render.depth, render.depth_sq, target.alpha, render.depth_ref, knee)
 
 
 @register_loss("planar")

@@ -17,17 +17,18 @@ void bind_image(nb::module_& m) {
         WithoutGil(), "Mean binary cross-entropy of pred clamped to [low, high], n floats each; with `grad`, its gradient times factor goes there.");
     m.def(
         "depth_spread",
-        [](const std::array<Address, 7>& at, int64_t n, float ref, float factor, int threads) {
+        [](const std::array<Address, 7>& at, int64_t n, float ref, float per_knee, float factor, int threads) {
             const float* target = pointer<const float>(at[3]);
             const int64_t count = count_inside(target, n);
             const double weight = 1.0 / double(count ? count : 1);
             nb::gil_scoped_release release;
             return weight * depth_spread({pointer<const float>(at[0]), pointer<const float>(at[1]), pointer<const float>(at[2]), target,
-                                          pointer<float>(at[4]), pointer<float>(at[5]), pointer<float>(at[6]), ref, factor * float(weight)},
+                                          pointer<float>(at[4]), pointer<float>(at[5]), pointer<float>(at[6]), ref, factor * float(weight), per_knee},
                                          n, threads);
         },
-        "addresses (alpha, depth, depth_sq, target alpha; gradients to the first three, 0 = none), n, ref, factor, threads: mean over the "
-        "pixels with target alpha above one half of alpha depth_sq - (depth - ref alpha)^2, or its gradients times factor.");
+        "addresses (alpha, depth, depth_sq, target alpha; gradients to the first three, 0 = none), n, ref, 1 / knee^2, factor, threads: "
+        "mean over the pixels with target alpha above one half of v / (1 + v / knee^2), v = alpha depth_sq - (depth - ref alpha)^2, or "
+        "its gradients times factor.");
     m.def(
         "compose",
         [](Address colour, Address alpha8, Address image, Address alpha, const std::array<float, 3>& background, int64_t n, int threads) {

@@ -13,11 +13,13 @@ struct CrossEntropy {
     float low, high, scale;  // pred is clamped to [low, high]; gradient of the sum times `scale`
 };
 
-// sum over pixels with target above one half of alpha depth_sq - (depth - ref alpha)^2, and its gradients times `scale`.
+// sum over pixels with target above one half of v / (1 + v / knee^2), v = alpha depth_sq - (depth - ref alpha)^2, and
+// its gradients times `scale`.
 struct DepthSpread {
     const float *alpha, *depth, *depth_sq, *target;
     float *v_alpha, *v_depth, *v_depth_sq;  // all null: the value, else the gradients
     float ref, scale;
+    float per_knee;  // 1 / knee^2; 0: v itself
 };
 
 // Premultiplied bytes over a background: image [n, 3], alpha [n].

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -30,24 +32,30 @@ def clamped_cross_entropy(pred: Tensor, target: Tensor, eps: float) -> Tensor:
     return _CrossEntropy.apply(pred, target, float(eps))
 
 
-def depth_spread(alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float) -> Tensor:
-    """Mean of alpha depth_sq - (depth - ref alpha)^2 over the pixels with target > 1/2, a scalar; 0 where there are
-    none.
+def depth_spread(
+    alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float, knee: float = math.inf
+) -> Tensor:
+    """Mean of v / (1 + v / knee^2), v = alpha depth_sq - (depth - ref alpha)^2, over the pixels with target > 1/2, a
+    scalar; 0 where there are none.
 
     alpha, depth, depth_sq: as accumulated by the rasterizer (``RenderOutput``), depth_sq about ``ref``; target: the
-    photograph's alpha. All of one shape; differentiable by the first three. Raises ValueError for shapes that differ.
+    photograph's alpha. All of one shape; differentiable by the first three. knee: in the unit of depth; beyond it v
+    counts ever less, knee^2 at most (Geman and McClure 1985; inf: v itself). Raises ValueError for shapes that differ.
     """
     _same_shape("depth_spread", alpha, depth, depth_sq, target)
     if _fast(alpha, depth, depth_sq, target):
-        return _DepthSpread.apply(alpha, depth, depth_sq, target.detach(), float(ref))
-    return recorded(_depth_spread, alpha, depth, depth_sq, target.detach(), float(ref))
+        return _DepthSpread.apply(alpha, depth, depth_sq, target.detach(), float(ref), knee**-2)
+    return recorded(_depth_spread, alpha, depth, depth_sq, target.detach(), float(ref), knee**-2)
 
 
-def _depth_spread(alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float) -> Tensor:
+def _depth_spread(
+    alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float, per_knee: float
+) -> Tensor:
     """``depth_spread`` written for reading: any floating dtype and device."""
     inside = (target > 0.5).to(alpha.dtype)
     first = depth - ref * alpha
-    return ((alpha * depth_sq - first * first) * inside).sum() / inside.sum().clamp_min(1)
+    v = alpha * depth_sq - first * first
+    return (v / (1 + per_knee * v.clamp_min(0)) * inside).sum() / inside.sum().clamp_min(1)
 
 
 def greatest_around(maps: Tensor) -> Tensor:
@@ -88,23 +96,21 @@ class _CrossEntropy(torch.autograd.Function):
 
 class _DepthSpread(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, alpha, depth, depth_sq, target, ref):
+    def forward(ctx, alpha, depth, depth_sq, target, ref, per_knee):
         inputs = [t.contiguous() for t in (alpha, depth, depth_sq, target)]
         ctx.save_for_backward(*inputs)
-        ctx.ref = ref
-        return alpha.new_tensor(
-            native.depth_spread([*(t.data_ptr() for t in inputs), 0, 0, 0], alpha.numel(), ref, 1.0, num_threads())
-        )
+        ctx.options = ref, per_knee
+        addresses = [*(t.data_ptr() for t in inputs), 0, 0, 0]
+        return alpha.new_tensor(native.depth_spread(addresses, alpha.numel(), *ctx.options, 1.0, num_threads()))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_output):
         inputs = ctx.saved_tensors
         out = [torch.empty_like(inputs[0]) for _ in range(3)]
-        native.depth_spread(
-            [t.data_ptr() for t in (*inputs, *out)], out[0].numel(), ctx.ref, grad_output.item(), num_threads()
-        )
-        return *out, None, None
+        addresses = [t.data_ptr() for t in (*inputs, *out)]
+        native.depth_spread(addresses, out[0].numel(), *ctx.options, grad_output.item(), num_threads())
+        return *out, None, None, None
 
 
 def compose(colour: Tensor, alpha8: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:

@@ -177,6 +177,10 @@ def test_depth_variance_is_twice_its_mean_over_the_foreground():
     assert LOSSES["depth_variance"](weight=1.0, end_weight=None)(inputs).item() == pytest.approx(
         2 * sum(terms) / len(terms)
     )
+    bent = [v / (1 + v / 0.25) for v in terms]  # v is as large as knee^2: half of it counts
+    assert LOSSES["depth_variance"](weight=1.0, end_weight=None, knee=0.5)(inputs).item() == pytest.approx(
+        2 * sum(bent) / len(bent)
+    )
     default = LOSSES["depth_variance"]()
     assert default.weight_at(0, 100) == 30
     assert default.weight_at(50, 100) == pytest.approx(math.sqrt(300))
@@ -186,6 +190,29 @@ def test_depth_variance_is_twice_its_mean_over_the_foreground():
     first = r.depth - 1.5 * r.alpha
     flat = replace(inputs, render=replace(r, depth_sq=first * first / r.alpha))
     assert default(flat).abs().item() < 1e-9
+
+
+def test_depth_variance_pulls_two_surfaces_less_than_fog():
+    """A ray that meets half of its light at either of two depths: the pull on the nearer one's opacity."""
+
+    def pull(apart: float, knee: float | None) -> float:
+        nearer = torch.tensor(0.4, dtype=F64, requires_grad=True)
+        share = torch.stack([nearer, 1 - nearer])
+        z = torch.tensor([-apart / 2, apart / 2], dtype=F64)
+        first, second = (share * z).sum(), (share * z * z).sum()
+        render = replace(
+            make_inputs().render,
+            alpha=torch.ones(1, 1, dtype=F64),
+            depth=first.reshape(1, 1),
+            depth_sq=second.reshape(1, 1),
+            depth_ref=0.0,
+        )
+        target = replace(make_inputs().target, alpha=torch.ones(1, 1, dtype=F64))
+        loss = LOSSES["depth_variance"](weight=1.0, end_weight=None, knee=knee)
+        return torch.autograd.grad(loss(replace(make_inputs(), render=render, target=target)), nearer)[0].item()
+
+    assert pull(0.02, 0.1) == pytest.approx(pull(0.02, None), rel=0.03)
+    assert 0 < pull(0.6, 0.1) < 0.05 * pull(0.6, None)
 
 
 @pytest.mark.parametrize("name", ["render", "alpha", "depth", "depth_variance"])

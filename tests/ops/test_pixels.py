@@ -1,5 +1,7 @@
 """Sums over pixels: the native passes against torch in float64."""
 
+import math
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -32,15 +34,18 @@ def test_cross_entropy_follows_torch(isa, threads, shape):
     assert not grad.flatten()[::7].any()
 
 
+@pytest.mark.parametrize("knee", [math.inf, 0.02])
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (131, 177)])
-def test_depth_spread_follows_torch(isa, threads, shape):
+def test_depth_spread_follows_torch(isa, threads, shape, knee):
     alpha = image(*shape)
     depth = alpha * (2 + 0.1 * image(*shape, seed=1))
     square = alpha * (0.1 * image(*shape, seed=2)) ** 2
     target = image(*shape, seed=3)
     leaves = [alpha, depth, square]
-    ours, grads = value_and_gradients(lambda *x: depth_spread(*x, target, 2.0), leaves)
-    exact, true = value_and_gradients(lambda *x: depth_spread(*x, target.double(), 2.0), [t.double() for t in leaves])
+    ours, grads = value_and_gradients(lambda *x: depth_spread(*x, target, 2.0, knee), leaves)
+    exact, true = value_and_gradients(
+        lambda *x: depth_spread(*x, target.double(), 2.0, knee), [t.double() for t in leaves]
+    )
     torch.testing.assert_close(ours.double(), exact, rtol=1e-4, atol=1e-8)
     for a, b in zip(grads, true, strict=True):
         assert (a - b).norm() <= 1e-5 * b.norm()
