@@ -13,7 +13,7 @@ from p2gs.ops.pixels import depth_range, depth_spread
 from p2gs.ops.planar import hidden_bends
 from p2gs.ops.planes import plane_error
 from p2gs.ops.rays import camera_rays
-from p2gs.types import RenderOutput
+from p2gs.types import RenderOutput, UserError
 
 
 @register_loss("depth")
@@ -107,6 +107,10 @@ class DepthVariance(Loss):
     weight: float = 30.0
     end_weight: float | None = 10.0
     knee: float | None = None
+
+    def __post_init__(self):
+        if self.knee is not None and not self.knee > 0:
+            raise UserError(f"losses.depth_variance.knee: expected a length above 0 or null, got {self.knee}")
 
     def compute(self, inputs: LossInputs) -> Tensor | None:
         render, target = inputs.render, inputs.target

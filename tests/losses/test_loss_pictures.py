@@ -9,7 +9,7 @@ from torch.autograd import gradcheck
 
 from p2gs.losses import LOSSES
 from p2gs.losses.base import LossInputs, Target
-from p2gs.types import Camera, GaussianTensors, RenderOutput
+from p2gs.types import Camera, GaussianTensors, RenderOutput, UserError
 
 F64 = torch.float64
 
@@ -213,6 +213,8 @@ def test_depth_variance_pulls_two_surfaces_less_than_fog():
 
     assert pull(0.02, 0.1) == pytest.approx(pull(0.02, None), rel=0.03)
     assert 0 < pull(0.6, 0.1) < 0.05 * pull(0.6, None)
+    with pytest.raises(UserError, match="knee: expected a length above 0 or null, got 0"):
+        LOSSES["depth_variance"](knee=0.0)
 
 
 @pytest.mark.parametrize("name", ["render", "alpha", "depth", "depth_variance"])
