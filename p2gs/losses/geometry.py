@@ -3,8 +3,6 @@ the Gaussians themselves."""
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -116,8 +114,7 @@ class DepthVariance(Loss):
         render, target = inputs.render, inputs.target
         if render is None or target is None or render.depth_sq is None:
             return None
-        knee = math.inf if self.knee is None else self.knee
-        return 2 * depth_spread(render.alpha, render.depth, render.depth_sq, target.alpha, render.depth_ref, knee)
+        return 2 * depth_spread(render.alpha, render.depth, render.depth_sq, target.alpha, render.depth_ref, self.knee)
 
 
 @register_loss("planar")

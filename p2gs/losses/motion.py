@@ -11,6 +11,7 @@ from p2gs.losses.base import Loss, LossInputs, PartState, register_loss
 from p2gs.losses.parts import sample_rows
 from p2gs.ops import so3
 from p2gs.ops.repel import repel_force
+from p2gs.ops.robust import geman_mcclure
 
 
 class Pairs(NamedTuple):
@@ -55,13 +56,10 @@ def carried(transforms: Tensor, points: Tensor) -> Tensor:
 
 
 def squared(residual: Tensor, robust: float | None, extent: float, dim: int = -1) -> Tensor:
-    """|r|^2 of [...] over dimension ``dim``, which goes; with ``robust`` (a fraction of the extent) Geman-McClure's s^2
-    r^2 / (s^2 + r^2)."""
+    """|r|^2 of [...] over dimension ``dim``, which goes; with ``robust``, a fraction of the extent, by
+    ``ops.robust.geman_mcclure``."""
     sq = residual.square().sum(dim)
-    if robust is None:
-        return sq
-    scale = (robust * extent) ** 2
-    return scale * sq / (scale + sq)
+    return sq if robust is None else geman_mcclure(sq, (robust * extent) ** 2)
 
 
 def reduce_pairs(cost: Tensor, reduce: str, total: int) -> Tensor:

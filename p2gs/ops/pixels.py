@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from p2gs.native import native, num_threads
 from p2gs.ops.recorded import recorded
+from p2gs.ops.robust import geman_mcclure
 
 
 def _fast(*tensors: Tensor) -> bool:
@@ -33,29 +32,30 @@ def clamped_cross_entropy(pred: Tensor, target: Tensor, eps: float) -> Tensor:
 
 
 def depth_spread(
-    alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float, knee: float = math.inf
+    alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float, knee: float | None = None
 ) -> Tensor:
-    """Mean of v / (1 + v / knee^2), v = alpha depth_sq - (depth - ref alpha)^2, over the pixels with target > 1/2, a
-    scalar; 0 where there are none.
+    """Mean of v = alpha depth_sq - (depth - ref alpha)^2 over the pixels with target > 1/2, a scalar; 0 where there are
+    none.
 
     alpha, depth, depth_sq: as accumulated by the rasterizer (``RenderOutput``), depth_sq about ``ref``; target: the
-    photograph's alpha. All of one shape; differentiable by the first three. knee: in the unit of depth; beyond it v
-    counts ever less, knee^2 at most (Geman and McClure 1985; inf: v itself). Raises ValueError for shapes that differ.
+    photograph's alpha. All of one shape; differentiable by the first three. knee: in the unit of depth; where v is
+    beyond its square it counts ever less (``robust.geman_mcclure``). Raises ValueError for shapes that differ.
     """
     _same_shape("depth_spread", alpha, depth, depth_sq, target)
     if _fast(alpha, depth, depth_sq, target):
-        return _DepthSpread.apply(alpha, depth, depth_sq, target.detach(), float(ref), knee**-2)
-    return recorded(_depth_spread, alpha, depth, depth_sq, target.detach(), float(ref), knee**-2)
+        per_knee = 0.0 if knee is None else knee**-2
+        return _DepthSpread.apply(alpha, depth, depth_sq, target.detach(), float(ref), per_knee)
+    return recorded(_depth_spread, alpha, depth, depth_sq, target.detach(), float(ref), constants=(knee,))
 
 
 def _depth_spread(
-    alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float, per_knee: float
+    alpha: Tensor, depth: Tensor, depth_sq: Tensor, target: Tensor, ref: float, knee: float | None
 ) -> Tensor:
     """``depth_spread`` written for reading: any floating dtype and device."""
     inside = (target > 0.5).to(alpha.dtype)
     first = depth - ref * alpha
     v = alpha * depth_sq - first * first
-    return (v / (1 + per_knee * v.clamp_min(0)) * inside).sum() / inside.sum().clamp_min(1)
+    return ((v if knee is None else geman_mcclure(v, knee**2)) * inside).sum() / inside.sum().clamp_min(1)
 
 
 def greatest_around(maps: Tensor) -> Tensor:

@@ -9,6 +9,12 @@ CAUCHY_95 = 2.385  # deviations: Rey 1983, DOI 10.1007/978-3-642-69389-2
 MEDIAN_SIGMA = 1.4826  # a normal deviate's sigma over its median size
 
 
+def geman_mcclure(square: Tensor, scale: float) -> Tensor:
+    """Squares, any shape, of which none counts more than ``scale``, a square itself: s x / (s + x) (Geman and McClure
+    1985). What rounding made negative stays as it is."""
+    return scale * square / (scale + square.clamp_min(0))
+
+
 def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
     """The value, a scalar, below which half of the weight lies; any shape, weights of one shape with the values. 0 of
     none."""

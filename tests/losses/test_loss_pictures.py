@@ -177,7 +177,7 @@ def test_depth_variance_is_twice_its_mean_over_the_foreground():
     assert LOSSES["depth_variance"](weight=1.0, end_weight=None)(inputs).item() == pytest.approx(
         2 * sum(terms) / len(terms)
     )
-    bent = [v / (1 + v / 0.25) for v in terms]  # v is as large as knee^2: half of it counts
+    bent = [v / (1 + v / 0.25) for v in terms]  # v is up to three times knee^2
     assert LOSSES["depth_variance"](weight=1.0, end_weight=None, knee=0.5)(inputs).item() == pytest.approx(
         2 * sum(bent) / len(bent)
     )

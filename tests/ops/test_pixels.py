@@ -1,7 +1,5 @@
 """Sums over pixels: the native passes against torch in float64."""
 
-import math
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -34,7 +32,7 @@ def test_cross_entropy_follows_torch(isa, threads, shape):
     assert not grad.flatten()[::7].any()
 
 
-@pytest.mark.parametrize("knee", [math.inf, 0.02])
+@pytest.mark.parametrize("knee", [None, 0.02])
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (131, 177)])
 def test_depth_spread_follows_torch(isa, threads, shape, knee):
     alpha = image(*shape)
